@@ -23,7 +23,7 @@ def read_jsonl(path: Path) -> list[Any]:
     """Return the header and the records of a record file; an empty list if there is none.
 
     Args:
-        path: The file. Of a compressed file, the journal of an interrupted run is read, if it
+        path: The file. For a compressed file, the journal of an interrupted run is read if it
             holds more records.
     """
     journal = _journal_path(path)
@@ -32,7 +32,7 @@ def read_jsonl(path: Path) -> list[Any]:
 
 
 def write_jsonl(path: Path, header: Any, records: Iterable[Any]) -> None:
-    """Write a compressed record file in one step, in place of an earlier one.
+    """Write a compressed record file, or replace an earlier one, atomically.
 
     Args:
         path: The file; its folder is created if it does not exist.
@@ -51,15 +51,15 @@ def resume_jsonl(
 ) -> Generator[Any, None, None]:
     """Yield the header of a record file, its records, and the records that it lacks.
 
-    Each new record is appended to the file as soon as it is computed. It is yielded as it will be
-    read from the file.
+    Each new record is appended to the file as soon as it is computed. It is yielded after a JSON
+    round trip, so new and resumed records are equal.
 
     Args:
         path: The file; created, with its folders, if it does not exist.
-        header: Everything that determines the records. The file's header holds it, and the
-            `commit` at which the file was created.
+        header: Everything that determines the records. The file's header also holds the `commit`
+            at which the file was created.
         make_records: Receives the number of records in the file; yields those that follow.
-        upgrade_header: Converts a header written by an earlier version to today's form.
+        upgrade_header: Converts a header written by an earlier version to the current form.
 
     Raises:
         InputError: The file has another header, or another process is appending to it.
@@ -110,7 +110,7 @@ def _compressed_lines(path: Path) -> list[str]:
 
 
 def _write_compressed(path: Path, lines: Iterable[str]) -> None:
-    """Write a compressed file; equal lines give equal bytes."""
+    """Write a compressed file without a time stamp, so that equal lines give equal bytes."""
     with atomic_write(path) as temporary:
         temporary.write_bytes(gzip.compress("".join(lines).encode(), mtime=0))
 

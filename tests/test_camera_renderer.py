@@ -143,7 +143,7 @@ def test_shapes_and_types(camera: CameraRenderer) -> None:
 def outline(
     camera: CameraRenderer, o: SceneObject
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return corners and centroid of the object's convex outline in the image [pixels]."""
+    """Return corners and centroid of the object's convex outline in the image [px]."""
     points = camera.camera.project(o.corners_T)
     around = points[ConvexHull(points).vertices]
     following = np.roll(around, -1, axis=0)

@@ -70,7 +70,7 @@ def largest_clear(belief: Belief, observation: Observation, rng: np.random.Gener
 
 
 class OracleExplorer:
-    """Oracle policy: follows the plans of `OracleSearch`, which knows the true scene.
+    """Oracle policy: follows the plans of `OracleSearch`, computed from the true scene.
 
     It has no move if there is no plan. Objects are placed where the plan puts them as long as only
     the moves draw from the random generator of the episode.

@@ -1,6 +1,6 @@
-"""Trained exploration policies: the student, which knows K_t, and the privileged teacher.
+"""Trained exploration policies: the student, which acts on K_t, and the privileged teacher.
 
-K_t is the set of the objects that have been in view; the teacher knows the true scene. Both
+K_t is the set of the objects seen so far; the teacher has access to the true scene. Both
 filter the network's moves at inference time. A move is discarded if the camera sees no free
 placement for it. If the tray has a free placement, the object is placed there instead of on the
 object that the network chose, where it is less stable and occludes more.

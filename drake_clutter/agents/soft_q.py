@@ -333,7 +333,7 @@ class SoftQLearner:
         )
 
     def warm_start(self, network: RuleQNetwork) -> None:
-        """Take over the weights of another network.
+        """Copy the weights of another network.
 
         Raises:
             InputError: The other network has another width.
@@ -391,7 +391,7 @@ class SoftQLearner:
         return max(0, self.step - self.config.learning_starts) // self.config.train_frequency
 
     def _update(self) -> float | None:
-        """Make one update; return its loss, or None if the replay buffer has too few steps."""
+        """Update once; return the loss, or None if the replay buffer has too few steps."""
         config = self.config
         count = max(NUM_GRADIENT_SHARDS, config.batch_size // config.sequence_length)
         batch = self._buffer.sample_sequences(count, config.sequence_length, self._rng)

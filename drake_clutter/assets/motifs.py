@@ -17,8 +17,8 @@ class MotifPen:
 
     Attributes:
         draw: The picture.
-        center: Center of the piece [pixels].
-        radius: Radius of the piece [pixels].
+        center: Center of the piece [px].
+        radius: Radius of the piece [px].
         angle: Rotation of the piece [rad].
         accent: Accent color of the label.
         rng: Random generator for differences between pieces.
@@ -255,7 +255,7 @@ def scatter_motif(
 
     Args:
         draw: The picture.
-        size: Width and height of the picture [pixels].
+        size: Width and height of the picture [px].
         motif: The motif.
         accent: Accent color of the label.
     """

@@ -1,7 +1,7 @@
-"""The label of an object class: one picture with all its faces.
+"""Texture of an object class: a printed label with all faces in one image, an atlas.
 
-The picture of a box holds front and two sides, with the top above them; the back repeats the front,
-the bottom the top. The picture of a can holds the unrolled wrapper with the two ends above it.
+The atlas of a box holds front and two sides, with the top above them; the back repeats the front,
+the bottom the top. The atlas of a can holds the unrolled wrapper with the two ends above it.
 Everything is drawn at a higher resolution and scaled down, which smooths the edges.
 """
 
@@ -23,22 +23,27 @@ from drake_clutter.files import InputError
 __all__ = ["MOTIFS", "Texture", "draw_texture", "encode_png"]
 
 _TEXTURE_SIDE = 512
+"""Longest side of an atlas [px]."""
 _OVERSAMPLING = 3
+"""Resolution of drawing, as a multiple of that of the atlas."""
 _MAX_PIXELS_PER_MM = 6.0
+"""Highest resolution of an atlas [px/mm]."""
 _PALETTE_SIZE = 96
+"""Number of colors of a PNG file."""
 _MAX_TITLE_LENGTH = 24
+"""Largest number of characters of a title."""
 _METAL_COLOR, _DARK_METAL_COLOR, _LIGHT_METAL_COLOR = "#b4b8bd", "#8d9298", "#d6d9dc"
 _INK_COLOR = "#1c1c1c"
 
 
 @dataclass(frozen=True)
 class Texture:
-    """A label.
+    """Texture of an object class.
 
     Attributes:
-        image: All faces in one picture.
-        regions: Regions of a box's front, back, right, left, top and bottom, or of the side, top
-            and bottom of other shapes.
+        image: The atlas: all faces in one image.
+        regions: Regions of the atlas by face: front, back, right, left, top and bottom of a box;
+            side, top and bottom of other shapes.
     """
 
     image: Image.Image
@@ -50,8 +55,8 @@ class _Panel:
     """One face while it is drawn.
 
     Attributes:
-        image: The picture.
-        pixels_per_mm: Resolution.
+        image: The image.
+        pixels_per_mm: Resolution [px/mm].
     """
 
     image: Image.Image
@@ -71,7 +76,7 @@ class _Panel:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height [pixels]."""
+        """Width and height [px]."""
         return self.image.size
 
     def draw_rectangle(
@@ -96,7 +101,7 @@ class _Panel:
 
     def draw_text(
         self,
-        words: str,
+        text: str,
         color: str,
         left: float,
         top: float,
@@ -114,7 +119,7 @@ class _Panel:
         box = ((right - left) * w, (bottom - top) * h)
         choices = [
             (lines, rotate)
-            for lines in {words, words.replace(" ", "\n")}
+            for lines in {text, text.replace(" ", "\n")}
             for rotate in ((False, True) if allow_rotation else (False,))
         ]
         size, lines, is_rotated = max(
@@ -133,7 +138,7 @@ class _Panel:
 
 @lru_cache
 def _font(size: int) -> ImageFont.FreeTypeFont:
-    """Return the font of the labels in a size [pixels]."""
+    """Return the font of the labels in a size [px]."""
     return ImageFont.truetype(
         str(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans-Bold.ttf"), size
     )
@@ -141,18 +146,18 @@ def _font(size: int) -> ImageFont.FreeTypeFont:
 
 @lru_cache
 def _text_extent(lines: str, size: int) -> tuple[float, float, float, float]:
-    """Return left, top, right and bottom of text in a font size [pixels]."""
+    """Return left, top, right and bottom of text in a font size [px]."""
     return ImageDraw.Draw(Image.new("L", (1, 1))).multiline_textbbox(
         (0, 0), lines, font=_font(size), align="center", spacing=size * 0.1
     )
 
 
 def _font_size(lines: str, box: tuple[float, float]) -> int:
-    """Return the largest font size in which text fits into a box [pixels].
+    """Return the largest font size in which text fits into a box [px].
 
     Args:
         lines: The text.
-        box: Width and height of the box [pixels].
+        box: Width and height of the box [px].
     """
     left, top, right, bottom = _text_extent(lines, 100)
     return int(100 * min(box[0] / max(1, right - left), box[1] / max(1, bottom - top)))
@@ -169,7 +174,7 @@ def _text_mask(lines: str, size: int) -> Image.Image:
 
 
 def _draw_nutrition_table(width: int, height: int) -> Image.Image:
-    """Return a white table: heading, rule, rows of gray words and numbers."""
+    """Return a white table: heading, rule, rows of gray text and numbers."""
     table = Image.new("RGB", (max(8, width), max(8, height)), "white")
     draw = ImageDraw.Draw(table)
     w, h = table.size
@@ -186,7 +191,7 @@ def _draw_nutrition_table(width: int, height: int) -> Image.Image:
 
 
 def _draw_barcode(width: int, height: int) -> Image.Image:
-    """Return a picture of a bar code."""
+    """Return an image of a bar code."""
     code = Image.new("RGB", (max(8, width), max(8, height)), "white")
     draw = ImageDraw.Draw(code)
     w, h = code.size
@@ -207,9 +212,9 @@ def _draw_front(panel: _Panel, label: LabelDesign, title: str, mass: float) -> N
     """Draw the title on top, the motif below, and the weight at the bottom."""
     panel.draw_rectangle(0, 0, 1, 0.035, label.accent)
     slim = panel.size[1] > 2.5 * panel.size[0]
-    foot = 0.42 if slim else 0.36
-    panel.draw_text(title, label.accent, 0.07, 0.06, 0.93, foot - 0.02)
-    panel.draw_motif(label.motif, label.accent, 0, foot, 1, 0.90)
+    motif_top = 0.42 if slim else 0.36
+    panel.draw_text(title, label.accent, 0.07, 0.06, 0.93, motif_top - 0.02)
+    panel.draw_motif(label.motif, label.accent, 0, motif_top, 1, 0.90)
     panel.draw_text(
         f"NET WT {1000 * mass:.0f} g", label.accent, 0.06, 0.925, 0.94, 0.975, allow_rotation=False
     )
@@ -340,7 +345,7 @@ def _marker_panels(
 
 
 def _mesh_panels(object_class: ObjectClass, pixels_per_mm: float) -> dict[str, _Panel]:
-    """Return a strip over the height, with a band in the accent color below the top."""
+    """Return the faces of a mesh object: a strip with a band in the accent color."""
     side = _Panel.blank(20, 200, pixels_per_mm, object_class.label.base)
     side.draw_rectangle(0, 0.12, 1, 0.30, object_class.label.accent)
     return {"side": side, "top": side, "bottom": side}
@@ -379,7 +384,7 @@ def _atlas_size(object_class: ObjectClass) -> tuple[float, float]:
 
 
 def draw_texture(object_class: ObjectClass) -> Texture:
-    """Return the label of a class. The result is deterministic.
+    """Return the texture of a class. The result is deterministic.
 
     Raises:
         InputError: A field of the label cannot be drawn.
@@ -426,7 +431,7 @@ def draw_texture(object_class: ObjectClass) -> Texture:
 
 
 def encode_png(image: Image.Image) -> bytes:
-    """Return a picture as a PNG file with a palette, which keeps it small."""
+    """Return an image as a PNG file with a palette, which keeps it small."""
     buffer = io.BytesIO()
     image.quantize(_PALETTE_SIZE, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
     return buffer.getvalue()

@@ -97,6 +97,7 @@ class Camera(StrictModel):
     @property
     def is_vertical(self) -> bool:
         """Whether the optical axis is vertical."""
+        # Elements 8 and 9 of the 3 x 4 matrix are x and y of the optical axis in T.
         return self.pinhole.X_CT[8:10] == (0.0, 0.0)
 
     @property
@@ -105,12 +106,12 @@ class Camera(StrictModel):
         return _pinhole(self)
 
     def to_camera(self, p_T: Floats) -> Floats:
-        """Transform points from T to C [m]. Shapes (m, 3)."""
+        """Return points in C [m], shape (m, 3), for points in T [m], shape (m, 3)."""
         X_CT = _X_CT(self)
         return np.asarray(p_T @ X_CT[:, :3].T + X_CT[:, 3])
 
     def depth(self, p_T: Floats) -> Floats:
-        """Return the depth of points in T, shape (m, 3) [m]. Shape (m,)."""
+        """Return the depth [m], shape (m,), of points in T [m], shape (m, 3)."""
         return self.to_camera(p_T)[:, 2]
 
     def project(self, p_T: Floats) -> Floats:

@@ -24,7 +24,7 @@ ResumableOutOption = Annotated[
     typer.Option(
         "--out",
         metavar="DIR",
-        help="Output folder: new, empty, or of the same job, which resumes.",
+        help="Output folder: new, empty, or of the same job, which is resumed.",
     ),
 ]
 SeedOption = Annotated[
@@ -69,7 +69,7 @@ SetOption = Annotated[
 ]
 ObjectsOption = Annotated[
     str,
-    typer.Option("--objects", help="Object set: ycb7, pantry14, or one of your own catalog."),
+    typer.Option("--objects", help="Object set: ycb7, pantry14, or a set of your own catalog."),
 ]
 MaxMovesOption = Annotated[
     int | None,

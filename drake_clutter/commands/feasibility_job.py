@@ -93,7 +93,7 @@ class TargetPose:
 
 @dataclass(frozen=True)
 class FeasibilityJob:
-    """Everything that decides the results of a study.
+    """Everything that determines the results of a study.
 
     Attributes:
         scenes: Scene files.
@@ -354,7 +354,7 @@ def run_feasibility_study(
         The summary.
 
     Raises:
-        InputError: A scene file cannot be used, or the folder holds something else.
+        InputError: A scene file cannot be used, or the folder holds other results.
     """
     for path in job.scenes:
         load_scene(path, load_catalog(job.catalog_folder))
@@ -460,7 +460,7 @@ def _write_results(
 def _write_csv(
     path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None
 ) -> None:
-    """Write a table; the default columns are those of the first row, and none of an empty table."""
+    """Write a table with given columns or those of the first row; nothing without columns."""
     columns = columns or (list(rows[0]) if rows else [])
     if not columns:
         return

@@ -74,7 +74,7 @@ def generate_scenes(
         The summary.
 
     Raises:
-        InputError: An option is not allowed, the folder holds something else, or there is no Ray
+        InputError: An option is not allowed, the folder holds other results, or there is no Ray
             cluster at the address.
     """
     if count < 1:

@@ -20,10 +20,10 @@ def open_job_folder(out: Path, job: Mapping[str, Any]) -> None:
 
     Args:
         out: Output folder.
-        job: Everything that decides the results, as a document.
+        job: Everything that determines the results, as a document.
 
     Raises:
-        InputError: The folder holds something else.
+        InputError: The folder holds results of another job, or other files.
     """
     path = out / JOB_FILE
     if not path.exists():

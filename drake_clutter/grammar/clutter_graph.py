@@ -62,8 +62,9 @@ class ClutterGraph:
             edges: Kinds by (parent, child).
 
         Raises:
-            ValueError: Node 0 is not the only tray, an edge has an unknown end, a node cannot be
-                reached from the tray, or an `end` node has children.
+            ValueError: Node 0 is not the only tray, an edge refers to an unknown node, a node
+                cannot be reached from the tray, the graph has a cycle, or an `end` node has
+                children.
         """
         if [node for node, kind in nodes.items() if kind == TRAY] != [cls.TRAY_NODE]:
             raise ValueError("nodes: expected exactly one tray, as node 0")
@@ -125,7 +126,7 @@ class ClutterGraph:
         return order
 
     def stack_bases(self) -> list[list[int]]:
-        """Return the nodes on the tray by stack: one object, or the two of a pair."""
+        """Return the nodes on the tray by stack: one object, or both objects of a pair."""
         bases: dict[int, list[int]] = {}
         for node in self.children(self.TRAY_NODE):
             base = next((child for child in self.children(node) if self.kind(child) == DUMMY), node)
@@ -157,7 +158,7 @@ class ClutterGraph:
 
     @property
     def is_terminal(self) -> bool:
-        """Whether all attributes are terminal, so that the graph can become a scene."""
+        """Whether all node and edge kinds are terminal, so that the graph can become a scene."""
         return not any(
             kind in NON_TERMINAL_KINDS for _, kind in self.digraph.nodes(data="kind")
         ) and not any(

@@ -1,4 +1,4 @@
-"""The production rules as data: each is a pair of small graphs (G_L, G_R).
+"""Production rules of the clutter grammar, each a pair of graphs (G_L, G_R).
 
 Nodes in both graphs are kept, nodes only in G_L are removed, and nodes only in G_R are new. In G_L,
 nodes and edges state the kinds that they match. In G_R, they state the kind that they get, or
@@ -27,7 +27,7 @@ PAIR_ORIENTATION = {
     PairArrangement.LYING: Orientation.FLAT_0,
     PairArrangement.STANDING: Orientation.UPRIGHT_0,
 }
-"""Orientation of a pair, which also distinguishes the two arrangements of a class."""
+"""Orientation of both objects of a pair, by the arrangement of the pair."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Pattern:
         nodes: Kinds that match, by the node's name in the rule.
         edges: (parent, child), all primitive. The parent of each edge is the root or an earlier
             child.
-        target: The node that the rules replace or orient, or on which they put something.
+        target: Node that a rule replaces or orients, or to which it adds a child.
     """
 
     nodes: Mapping[str, frozenset[str]]
@@ -52,7 +52,7 @@ class ProductionRule:
 
     Attributes:
         name: Unique name in the grammar, such as `insert_meta_pudding_box_1`.
-        left: G_L.
+        left: Left-hand side G_L.
         right_nodes: Kind of each node of G_R, or `KEEP`.
         right_edges: Kind of each edge of G_R.
     """

@@ -198,7 +198,7 @@ def _first_match(graph: ClutterGraph, left: Pattern, roots: Iterable[int]) -> Ma
 
     Args:
         graph: The graph.
-        left: G_L.
+        left: Left-hand side G_L.
         roots: Candidates for the root, in order.
     """
     # networkx's views would take longer than the matching itself.

@@ -74,8 +74,8 @@ class TrainingRun:
             input_files: Files that the run learns from; they must be unchanged when it is resumed.
 
         Raises:
-            InputError: The folder holds something else, or a run with another configuration or
-                other input files.
+            InputError: The folder holds other files, or a run with another configuration or other
+                input files.
         """
         self._folder = folder
         self._config = config

@@ -1,4 +1,4 @@
-"""Detector that sees only images: a network segments the objects, geometry fits their poses."""
+"""Detector on images: a network segments the objects, a geometric fit gives their poses."""
 
 from collections import Counter, deque
 from collections.abc import Sequence
@@ -151,13 +151,13 @@ class LearnedDetector:
         camera: Camera,
         support: Support,
     ) -> None:
-        """Make a detector.
+        """Create a detector.
 
         Args:
             network: Trained network.
-            classes: Classes to detect, all of which the network must know.
+            classes: Classes to detect; the network must have been trained with all of them.
             camera: Camera of the images.
-            support: What the objects stand on.
+            support: Support of the objects.
         """
         self._network = network
         self._camera = camera

@@ -125,7 +125,7 @@ class PoseFitter:
     """Fit the poses of boxes and cylinders to segments of a depth image."""
 
     def __init__(self, camera: Camera) -> None:
-        """Make a fitter for a camera's images."""
+        """Create a fitter for a camera's images."""
         self.camera = camera
         self._models: dict[ObjectClass, tuple[Any, Any]] = {}
 

@@ -34,6 +34,7 @@ MIN_UNCLAIMED_PIXELS = 25
 """Smallest number of a pose's consistent pixels that no selected pose explains."""
 OBJECT_COST = 200
 """Number of pixels that one more object must explain to be worth selecting."""
+# Result of the comparison of one pixel.
 _INCONCLUSIVE = 0
 _CONSISTENT = 1
 _FREE_SPACE = 2
@@ -76,11 +77,11 @@ class PoseEvidence:
 
 
 @njit(cache=True, error_model="numpy")
-def _compare_with_depth(cylinder, half, R_TO, p_TO, depth, camera):  # type: ignore[no-untyped-def]
+def _compare_with_depth(is_cylinder, half, R_TO, p_TO, depth, camera):  # type: ignore[no-untyped-def]
     """Compare an object at a pose with a depth image.
 
     Args:
-        cylinder: Whether the object is a cylinder, not a box.
+        is_cylinder: Whether the object is a cylinder, not a box.
         half: Half sizes of the object [m]. Shape (3,).
         R_TO: Orientation. Shape (3, 3).
         p_TO: Position [m]. Shape (3,).
@@ -102,7 +103,7 @@ def _compare_with_depth(cylinder, half, R_TO, p_TO, depth, camera):  # type: ign
     row = np.empty(right - left)
     for v in range(top, bottom):
         ray, step = ray_row(R, v, camera)
-        cast_ray_row(cylinder, half_sizes, origin, ray, step, left - camera.u0, 1, row)
+        cast_ray_row(is_cylinder, half_sizes, origin, ray, step, left - camera.u0, 1, row)
         for u in range(left, right):
             expected = row[u - left]
             if expected == np.inf:
@@ -151,7 +152,7 @@ def select_consistent_poses(
     min_visible_fraction: float,
     conflict: Callable[[int, int], bool] = lambda a, b: False,
 ) -> list[int]:
-    """Select the poses that explain the most pixels with the fewest objects.
+    """Select the poses that explain the best_objective pixels with the fewest objects.
 
     The greedy selection is repeated with each unselected pose as its first one, and the best
     result counts.
@@ -168,13 +169,15 @@ def select_consistent_poses(
         Indices of the selected poses in the order of their selection.
     """
     plausible = [k for k, e in enumerate(evidence) if _is_plausible(e, min_visible_fraction)]
-    selected, most = _select_greedily(evidence, scores, image_shape, plausible, conflict, None)
+    selected, best_objective = _select_greedily(
+        evidence, scores, image_shape, plausible, conflict, None
+    )
     for first in [k for k in plausible if k not in selected]:
-        alternative, explained = _select_greedily(
+        alternative, objective = _select_greedily(
             evidence, scores, image_shape, plausible, conflict, first
         )
-        if explained > most:
-            selected, most = alternative, explained
+        if objective > best_objective:
+            selected, best_objective = alternative, objective
     return selected
 
 
@@ -197,12 +200,12 @@ def _select_greedily(
         first: Index of the pose that is selected first, or None for the best one.
 
     Returns:
-        Indices of the selected poses, and the number of pixels that they explain less free-space
-        violations and the cost of each object.
+        Indices of the selected poses, and the objective: the number of pixels that they explain,
+        minus free-space violations and the cost of each object.
     """
     claimed = np.zeros(image_shape, bool)
     selected = list[int]()
-    explained = 0
+    objective = 0
     # Upper bound of the score that each pose can still add. The number of unclaimed pixels only
     # decreases, so a pose whose bound is exact and largest is the best one.
     bounds = dict.fromkeys(plausible, math.inf)
@@ -223,13 +226,13 @@ def _select_greedily(
             continue
         claimed[e.window] |= e.consistent
         selected.append(best)
-        explained += gain - OBJECT_COST
-    return selected, explained
+        objective += gain - OBJECT_COST
+    return selected, objective
 
 
 def _is_plausible(e: PoseEvidence, min_visible_fraction: float) -> bool:
     num_consistent = int(np.count_nonzero(e.consistent))
     num_conclusive = num_consistent + e.num_free_space_violations
-    enough = max(1.0, min_visible_fraction * e.num_unoccluded_pixels)
-    is_visible = num_consistent >= enough
+    min_consistent = max(1.0, min_visible_fraction * e.num_unoccluded_pixels)
+    is_visible = num_consistent >= min_consistent
     return is_visible and e.num_free_space_violations <= MAX_FREE_SPACE_FRACTION * num_conclusive

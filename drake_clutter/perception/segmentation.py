@@ -37,15 +37,15 @@ RENAMED_MODULES = {"into": "stem", "middle": "bottleneck", "narrow": "lateral"}
 OUTPUT_STRIDE = 2
 """Image pixels per output cell of the network, in both directions."""
 WINDOW_MULTIPLE = 16
-"""The side of a window is a multiple of the network's total stride [px]."""
+"""Total stride of the network, of which the side of a window is a multiple [px]."""
 MAX_SCENE_HEIGHT = 0.5
 """Height up to which everything above the support is in the window [m]."""
 CHANNELS = (24, 48, 96, 128)
 """Number of channels at each resolution of the network."""
 HEIGHT_UNIT = 0.25
-"""Height of the network's input 1 [m]."""
+"""Height that corresponds to a network input of 1 [m]."""
 VOTE_UNIT = 0.05
-"""Vote of the network's output 1 [m]."""
+"""Offset that corresponds to a network output of 1 [m]."""
 HAS_FAST_BFLOAT16 = bool(torch.cpu.get_capabilities().get("amx_bf16"))
 """Whether the CPU multiplies bfloat16 matrices in hardware, which is three times as fast."""
 PIXEL_SIZE = 0.0025
@@ -66,7 +66,7 @@ class ImageWindow:
 
     @staticmethod
     def around_support(camera: Camera, support: Support) -> "ImageWindow":
-        """Return the window of a camera that looks at a support."""
+        """Return the smallest window of a camera that contains a support, if there is one."""
         size = np.array([camera.width, camera.height])
         center, required_side = camera.support_bounds(support, MAX_SCENE_HEIGHT) or (
             np.array(camera.principal_point),
@@ -104,7 +104,7 @@ def backproject_window(
 
 
 def downsample(array: NDArray[Scalar]) -> NDArray[Scalar]:
-    """Return the pixels of a window at the network's cells.
+    """Return every second pixel of a window, one for each output cell of the network.
 
     Args:
         array: Shape (side, side, ...).
@@ -118,7 +118,7 @@ def downsample(array: NDArray[Scalar]) -> NDArray[Scalar]:
 def upsample(
     mask: NDArray[np.bool_], window: ImageWindow, image_shape: tuple[int, int]
 ) -> NDArray[np.bool_]:
-    """Return a mask of the network's cells as a mask of the image.
+    """Return a mask of the network's output cells as a mask of the image.
 
     Args:
         mask: Mask of cells. Shape (side / 2, side / 2).
@@ -185,8 +185,8 @@ class SegmentationNetwork(nn.Module):
     """U-Net (Ronneberger et al. 2015) with additive skip connections.
 
     Attributes:
-        classes: Names of the classes that it distinguishes.
-        use_color: Whether its input has color channels.
+        classes: Names of the object classes.
+        use_color: Whether the input has color channels.
     """
 
     def __init__(self, classes: Sequence[str], use_color: bool) -> None:
@@ -232,10 +232,10 @@ class SegmentationNetwork(nn.Module):
         return output[:, :-3], output[:, -3:] * VOTE_UNIT
 
     def warm_start(self, pretrained: "SegmentationNetwork") -> None:
-        """Take over the weights of another network.
+        """Copy weights of another network, as far as both networks have them.
 
-        The outputs for classes that both networks have are those of the other network, whatever
-        the color is.
+        Weights of new input channels are zero, so the outputs for common classes are those of the
+        other network, whatever the color is.
         """
         first_layer = "stem.1.0.weight"
         shared = {
@@ -364,15 +364,15 @@ def cluster_votes(votes, radius, min_votes):  # type: ignore[no-untyped-def]
         min_votes: Smallest number of votes of an object.
 
     Returns:
-        Number of each vote's object; negative: none. Shape (n,).
+        Index of each vote's cluster; negative: none. Shape (n,).
     """
-    number = np.full(len(votes), -1)
+    labels = np.full(len(votes), -1)
     is_free = np.ones(len(votes), np.bool_)
     num_objects = 0
     while True:
         first = _densest_vote(votes, is_free, radius)
         if first < 0:
-            return number
+            return labels
         x, y, z = votes[first]
         for _ in range(3):
             total, sx, sy, sz = 0, 0.0, 0.0, 0.0
@@ -390,10 +390,10 @@ def cluster_votes(votes, radius, min_votes):  # type: ignore[no-untyped-def]
             a, b, c = votes[j, 0] - x, votes[j, 1] - y, votes[j, 2] - z
             if is_free[j] and (j == first or a * a + b * b + c * c < radius * radius):
                 is_free[j] = False
-                number[j] = num_objects
+                labels[j] = num_objects
                 total += 1
         if total < min_votes:
-            number[number == num_objects] = -2  # These votes are not considered again.
+            labels[labels == num_objects] = -2  # These votes are not considered again.
         else:
             num_objects += 1
 
@@ -403,7 +403,7 @@ class Segment:
     """Pixels of one object.
 
     Attributes:
-        class_name: Name of its class.
+        class_name: Name of the object's class.
         mask: Pixels of the object. Shape (H, W).
         p_TO: Estimated position of the object's center [m]. Shape (3,).
     """
@@ -441,9 +441,9 @@ def extract_segments(
         if len(rows) < min_votes:
             continue
         votes = votes_T[rows, columns].astype(np.float64)
-        number = cluster_votes(votes, radius, min_votes)
-        for cluster in range(number.max() + 1):
-            is_member = number == cluster
+        labels = cluster_votes(votes, radius, min_votes)
+        for cluster in range(labels.max() + 1):
+            is_member = labels == cluster
             cells = np.zeros(class_map.shape, bool)
             cells[rows[is_member], columns[is_member]] = True
             p_TO = np.median(votes[is_member], axis=0)

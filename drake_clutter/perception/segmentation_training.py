@@ -157,7 +157,7 @@ class SegmentationLearner:
             num_images: Number of images.
             config: Hyperparameters.
             camera: Camera of the images.
-            support: What the objects stand on.
+            support: Support of the objects.
             seed: Seed of the batches and augmentations.
             device: Device of the network.
         """

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 _NUM_BISECTIONS = 50
-"""Bisection steps for the largest controllable x; reduces the interval below double precision."""
+"""Bisection steps for the largest controllable x, to below double precision."""
 
 
 @njit(cache=True, nogil=True)

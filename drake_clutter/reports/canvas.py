@@ -18,15 +18,16 @@ from scipy.ndimage import binary_erosion, distance_transform_edt
 from scipy.spatial import ConvexHull
 
 _HALO = "#ffffff"
+"""Color of the border around lines, arrows and labels."""
 
 
 Rectangle = tuple[float, float, float, float]
-"""Left, top, right and bottom in pixels."""
+"""Left, top, right and bottom [px]."""
 
 
 @lru_cache
 def load_font(size: int) -> ImageFont.FreeTypeFont:
-    """Return a bold sans-serif font of a height in pixels."""
+    """Return a bold sans-serif font of a given height [px]."""
     return ImageFont.truetype(
         str(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans-Bold.ttf"), size
     )
@@ -41,7 +42,7 @@ class TextLabel:
         anchor: Point (x, y) that the label is about.
         target: Region (left, top, right, bottom) that the label should not cover.
         color: Color of its box, or of its text if `subtle`.
-        size: Height of the font in pixels.
+        size: Height of the font [px].
         subtle: Draw dark text on a pale box, without a line to the anchor.
     """
 
@@ -221,7 +222,7 @@ def innermost_point(mask: NDArray[np.bool_]) -> tuple[float, float]:
 
 
 def _intersection_area(a: Rectangle, b: Rectangle) -> float:
-    """Return the common area of two rectangles in square pixels."""
+    """Return the common area of two rectangles [px^2]."""
     width = min(a[2], b[2]) - max(a[0], b[0])
     height = min(a[3], b[3]) - max(a[1], b[1])
     return max(0.0, width) * max(0.0, height)

@@ -18,7 +18,7 @@ Settled objects overlap by about 0.01 mm.
 """
 
 _MIN_CROSS_LENGTH = 1e-9
-"""Cross products of unit edges shorter than this give no separating axis."""
+"""Shortest cross product of two unit vectors along edges that is a separating axis."""
 
 
 class _Polytope:
@@ -39,8 +39,8 @@ class _Polytope:
         for triangle, neighbors in enumerate(hull.neighbors):
             for opposite, neighbor in enumerate(neighbors):
                 normals = hull.equations[[triangle, neighbor], :3]
-                bends = np.abs(normals[0] - normals[1]).max() > 1e-6
-                if neighbor > triangle and bends:
+                is_edge = np.abs(normals[0] - normals[1]).max() > 1e-6
+                if neighbor > triangle and is_edge:
                     start, end = np.delete(hull.simplices[triangle], opposite)
                     edges.append(corners[end] - corners[start])
         self.edges = _distinct_directions(np.asarray(edges))
@@ -156,12 +156,13 @@ def objects_resting_on(
 ) -> tuple[str, ...]:
     """Return the names of the objects that stand or lean on an object.
 
-    Their bounding boxes begin where the object's ends, and overlap it seen from above.
+    The bottom of their bounding boxes is at the top of the object's, and the boxes overlap seen
+    from above.
 
     Args:
         carrier: The object that may carry others.
         objects: Objects of the scene.
-        margin: Tolerance of the height, and smallest overlap that counts [m].
+        margin: Largest difference of the heights, and smallest overlap that counts [m].
     """
     names = []
     for other in objects:

@@ -24,10 +24,10 @@ class InstabilityReason(Enum):
         TOPPLED: The object rotated past the limit.
         SLID: The object moved past the limit without rotating past its limit.
         LEFT_TRAY: The object fell off the support.
-        NOT_AT_REST: The object was still moving when the time was up.
+        NOT_AT_REST: The object was still moving at the end of the simulation time.
         UNBALANCED: No contact forces hold the object.
-        ROLLS: The object is held only on the line on which a lying cylinder carries.
-        UNSUPPORTED: Nothing is below the object; it misses another object that ends at its height.
+        ROLLS: The object is balanced on the contact line of a lying cylinder.
+        UNSUPPORTED: The object has nothing below it, but the top of another object beside it.
     """
 
     TOPPLED = "toppled"
@@ -68,7 +68,7 @@ class Verdict:
 
     Attributes:
         instability: The failed object, or None for a stable scene.
-        settled: X_TO of every object at the end, by name. A fall is followed only until it is
+        settled: X_TO of every object at the end, by name. The simulation ends when a fall is
             detected.
         visible_fractions: Fraction of each object's unoccluded pixels that the camera sees, by
             name; empty for an unstable scene.
@@ -94,14 +94,14 @@ class InconclusiveReason(Enum):
     """What a judge's model of a scene does not cover.
 
     Attributes:
-        LEANING: No face of the object is level.
+        LEANING: No face of the object is horizontal.
         NOT_CONVEX: The object has several convex pieces.
         OUTSIDE_TRAY: The object reaches beyond the support.
         INTERPENETRATING: The object overlaps another one or the support.
         FLOATING: Nothing is below or beside the object's bottom.
         EDGE_CONTACT: The object touches others only on an edge or a curved surface.
-        UNSUPPORTED: The object misses another one that ends at its height.
-        RESTS_NEVERTHELESS: The object rests in the given scene, but the model lets it fall.
+        UNSUPPORTED: The object has nothing below it, but the top of another object beside it.
+        RESTS_NEVERTHELESS: The object rests in the given scene, but the model predicts a fall.
     """
 
     LEANING = "leans"
@@ -133,14 +133,14 @@ class InconclusiveVerdict:
 
 
 class SceneJudge(Protocol):
-    """Decides whether a scene is stable and which objects it hides."""
+    """Decides whether a scene is stable and which of its objects are hidden."""
 
     def judge(self, scene: Scene, rng: np.random.Generator) -> Verdict | InconclusiveVerdict:
         """Return the verdict.
 
         Args:
             scene: The scene to judge.
-            rng: Draws small random offsets of the objects, which remove unstable equilibria.
+            rng: Random generator of small offsets of the objects, which remove unstable equilibria.
         """
 
 
@@ -240,7 +240,8 @@ class Outcome:
         result: How the move ended.
         scene: The scene after the move; the scene before it if nothing was moved.
         instability: The failed object of a collapsed scene.
-        motion: Recorded motion: a robot's whole move, or from the release of the picked object.
+        motion: Recorded motion of the whole move, or without an arm, of the scene after the
+            release.
         inconclusive: What the executor's model does not cover, if that is the result.
         detail: Reason why no plan was found, or a remark on the execution.
         X_TO_released: Pose at which the picked object was released.
@@ -277,13 +278,13 @@ class Detection:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """One image of the camera with its detections. It holds nothing that is hidden.
+    """One image of the camera with its detections, without any ground truth.
 
     Observations compare by identity, so that results derived from one can be cached.
 
     Attributes:
         depth: Depth along the camera's axis, inf where nothing is seen [m]. Shape (height, width).
-        detections: V_t, the objects that are detected in the image.
+        detections: Objects detected in the image (V_t).
         camera: The camera that took the image.
         support: The support that the objects stand on.
     """
@@ -314,8 +315,8 @@ class MoveExecutor(Protocol):
 
         Args:
             scene: The objects before the move, at rest.
-            command: What to carry out.
-            rng: Draws random release offsets.
+            command: Command to execute.
+            rng: Random generator of release offsets.
 
         Raises:
             KeyError: The command names an object that is not in the scene.

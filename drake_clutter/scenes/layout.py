@@ -1,4 +1,4 @@
-"""From a terminal graph to poses: resting objects, pairs, and stacks."""
+"""Layout of terminal clutter graphs: object poses in stacks on the support."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -95,7 +95,7 @@ class Stack:
         self._classes = classes
         self._resting = list[_RestingPose]()
         origins: list[list[float]] = []
-        floor = 0.0
+        base_height = 0.0
         level = list(bottom)
         parent = ClutterGraph.TRAY_NODE
         while level:
@@ -113,13 +113,13 @@ class Stack:
                 offset = (resting.upper[1] - resting.lower[1] + gap) / 2
             self.nodes += level
             self._resting += [resting] * len(level)
-            height = floor - resting.lower[2]
+            height = base_height - resting.lower[2]
             origins += (
                 [[0.0, 0.0, height]]
                 if len(level) == 1
                 else [[0.0, -offset, height], [0.0, offset, height]]
             )
-            floor = height + resting.upper[2]
+            base_height = height + resting.upper[2]
             parent = level[0]
             above = graph.children(parent)
             if above and graph.kind(above[0]) == DUMMY:
@@ -163,20 +163,20 @@ def _sample_positions(
     Args:
         half_sizes: Half sizes of S rectangles [m]. Shape (S, 2).
         support: The support.
-        config: Gap and number of attempts.
+        config: Gap between stacks and number of attempts.
         rng: Random generator.
 
     Returns:
         Centers of the rectangles [m], shape (S, 2), or None if no attempt succeeded.
     """
-    reach = support.half_size - config.stack_gap - half_sizes
-    if (reach < 0).any():
+    half_range = support.half_size - config.stack_gap - half_sizes
+    if (half_range < 0).any():
         return None
     order = np.argsort(-half_sizes.prod(axis=1), kind="stable")
     for _ in range(config.placement_attempts):
         centers = np.full_like(half_sizes, np.nan)
         for num_placed, stack in enumerate(order):
-            samples = rng.uniform(-1, 1, (config.placement_attempts, 2)) * reach[stack]
+            samples = rng.uniform(-1, 1, (config.placement_attempts, 2)) * half_range[stack]
             placed = order[:num_placed]
             gap = (
                 np.abs(samples[:, None] - centers[placed]) - half_sizes[placed] - half_sizes[stack]
@@ -202,7 +202,7 @@ def lay_out(
     A child stands centered on its parent's top. The two objects of a pair stand side by side along
     the tray's y axis, with their gap over the parent's center; a dummy node represents the pair's
     center and top. Stacks keep their orientation and get uniformly random positions at which their
-    axis-aligned footprints keep the gap.
+    axis-aligned footprints are at least `stack_gap` apart.
 
     Args:
         derivation: A terminal graph and its rules.

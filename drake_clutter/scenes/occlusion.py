@@ -1,7 +1,7 @@
 """Conservative occlusion volumes for planning under partial observability.
 
 They are boxes over the space behind or below known objects, and over depth points that belong to no
-known object. A planner that knows only the observed objects must treat them as solid.
+known object. A planner without ground truth must treat them as solid.
 """
 
 import math
@@ -33,9 +33,9 @@ _SURFACE_TOLERANCE = 0.008
 _MIN_POINTS = 12
 """Fewest unidentified depth points that form a box; fewer are noise at edges."""
 _EDGE_WINDOW = 25
-"""Side of the window around a pixel without arm and rim [pixels].
+"""Side of the window around a pixel without arm and rim [px].
 
-Closer to them, a depth camera has shadows of its own.
+Near their edges, the depth images of a stereo camera have holes.
 """
 _TOP_QUANTILE = 0.98
 """Quantile of the heights of unidentified points at which a box ends.
@@ -43,7 +43,7 @@ _TOP_QUANTILE = 0.98
 Higher points are outliers.
 """
 _PIXEL_STRIDE = 2
-"""Every so many-th pixel is used, in both directions."""
+"""Stride of the evaluated pixels, in both directions [px]."""
 _COLUMN_SIZE = 0.02
 """Side of the vertical columns into which the space behind objects is cut [m]."""
 _HEIGHT_RESOLUTION = 0.01
@@ -92,7 +92,7 @@ def occluded_boxes(
     """Return boxes over occluded space and over unidentified depth points.
 
     Args:
-        known_objects: K_t, the known objects at their present poses.
+        known_objects: Objects seen so far (K_t), at their current poses.
         observation: Latest observation.
         empty_depth: Depth image of the cell with an empty support and the arm at home [m].
             Shape (height, width).
@@ -231,18 +231,20 @@ def _unidentified_points(
     z = observation.depth[::_PIXEL_STRIDE, ::_PIXEL_STRIDE]
     floor = empty[::_PIXEL_STRIDE, ::_PIXEL_STRIDE]
     pixels = _PIXEL_STRIDE * pixel_grid(z.shape)
-    # Where the empty cell has no depth, a detector may have filled holes of the image.
+    # Pixels without depth in the empty cell are skipped: a detector may have filled them in.
     measured = np.isfinite(z) & (z > 0) & np.isfinite(floor)
     z = np.where(measured, z, np.nan)
     x, y, height = np.moveaxis(camera.backproject(pixels, z), -1, 0)
     half_x, half_y = observation.support.half_size
     is_on_support = (np.abs(x) < half_x) & (np.abs(y) < half_y)
-    left = measured & (z < floor - _MIN_HIDDEN_HEIGHT) & is_on_support
+    is_unidentified = measured & (z < floor - _MIN_HIDDEN_HEIGHT) & is_on_support
     for o in known_objects:
-        where = np.nonzero(left)
-        p_TP = np.column_stack([x[where], y[where], height[where]])
+        rows, columns = np.nonzero(is_unidentified)
+        p_TP = np.column_stack([component[rows, columns] for component in (x, y, height)])
         p_OP = (p_TP - o.X_TO.p) @ o.X_TO.rotation
-        own = (np.abs(p_OP) < np.asarray(o.object_class.size) / 2 + _SURFACE_TOLERANCE).all(axis=1)
-        left[where[0][own], where[1][own]] = False
-    part, _ = label(left)
-    return np.column_stack([x[left], y[left], height[left]]), part[left]
+        half_size = np.asarray(o.object_class.size) / 2 + _SURFACE_TOLERANCE
+        is_on_object = (np.abs(p_OP) < half_size).all(axis=1)
+        is_unidentified[rows[is_on_object], columns[is_on_object]] = False
+    patch, _ = label(is_unidentified)
+    p_TP = np.column_stack([component[is_unidentified] for component in (x, y, height)])
+    return p_TP, patch[is_unidentified]

@@ -89,7 +89,7 @@ def is_observed_free(observation: Observation, p_T: NDArray[np.float64]) -> NDAr
     """Return whether the camera sees past points, so that they are known to be free.
 
     Args:
-        observation: What the camera sees.
+        observation: Latest observation.
         p_T: Points in T [m]. Shape (N, 3).
 
     Returns:
@@ -302,7 +302,7 @@ def find_free_placements(
     the visible part of its top are returned; the center of mass is over that top.
 
     Args:
-        observation: What the camera sees before the pick.
+        observation: Observation before the pick.
         move: What to pick and where to put it.
         config: Clearance and release height.
 
@@ -358,7 +358,7 @@ def resolve_placement(
 
     Args:
         move: What to pick and where to put it.
-        observation: What the camera sees before the pick.
+        observation: Observation before the pick.
         config: Clearance and release height.
         rng: Draws one of several equally good placements.
 

@@ -99,7 +99,7 @@ def add_scene_plant(
     Args:
         builder: The diagram's builder.
         objects: Name and class of each object.
-        support: What the objects stand on.
+        support: Support of the objects.
         time_step: Time step of the simulation [s].
         visuals: Whether to add the textured meshes, for cameras and Meshcat.
         object_with_joint: Name of an object to which the caller adds a joint of its own.

@@ -44,7 +44,7 @@ def find_instability(
     Args:
         before: The object at its initial pose.
         after: Its present pose.
-        support: What it stands on.
+        support: Support of the object.
         config: Limits of displacement and tilt.
     """
     displacement = _distance(after, before.X_TO)
@@ -77,7 +77,7 @@ def settle(
 
     Args:
         objects: The objects to settle.
-        support: What they stand on.
+        support: Support of the objects.
         config: Time step and limits.
         record: Whether to record the motion.
         simulate_collapse: Whether to go on after a fall until all objects are at rest or the time

@@ -18,14 +18,17 @@ from drake_clutter.simulation.settle import find_instability, settle
 from drake_clutter.station.station_simulation import StationSimulation
 
 MIN_DISPLACEMENT = 1e-4
-"""Objects that moved less during the motion are not settled again [m]; above numerical drift."""
+"""Smallest displacement during the motion after which an object is settled again [m].
+
+Numerical drift is smaller.
+"""
 
 
 class ArmExecutor:
     """Execute moves at fidelity `arm` (a `MoveExecutor`).
 
     A move is planned, simulated along the whole trajectory, and evaluated. Objects that were
-    disturbed are settled afterwards with the settings of the Drake judge. The scene has collapsed
+    disturbed are settled afterwards, as `DrakeJudge` settles a scene. The scene has collapsed
     if an object exceeds the limits of displacement or tilt: the picked object relative to its
     release pose, any other relative to its pose before the move.
     """
@@ -49,7 +52,7 @@ class ArmExecutor:
         return planner.plan(scene.objects, command.move.pick, command.X_TO_place)
 
     def planner_for(self, support: Support) -> PickPlacePlanner:
-        """Return the planner for a support; the last one is reused."""
+        """Return the planner for a support; the planner of the last support is cached."""
         if self._planner is None or self._planner.cell.support != support:
             self._planner = PickPlacePlanner(
                 self._config.cell.with_support(support), self._planner_config
@@ -62,6 +65,7 @@ class ArmExecutor:
         if isinstance(plan, PlanningFailure):
             return Outcome(MoveResult.NOT_PLANNED, scene, detail=str(plan))
         result = StationSimulation(self._config.cell, scene).execute(plan, record=True)
+        # The arm lowers the object beyond its planned pose until contact.
         X_TO_place = plan.X_TO_place.translated((0.0, 0.0, -result.lowered_distance))
         after = scene.with_poses(result.poses)
         outcome = evaluate_outcome(
@@ -85,11 +89,11 @@ def evaluate_outcome(
         after: Scene after the motion.
         pick: Name of the picked object.
         X_TO_place: Pose at which the object was to be released.
-        lost_object: Whether the object came off the gripper before it was released.
+        lost_object: Whether the object detached from the gripper before it was released.
         config: Limits of displacement and tilt.
     """
     expected = before.with_poses({pick: X_TO_place})
-    # An object that comes off at touchdown and stays at its place pose counts as placed.
+    # An object that detaches at touchdown and stays at its place pose counts as placed.
     dropped = lost_object and worst_instability([expected[pick]], after, config) is not None
     checked = [o for o in expected.objects if o.name != pick or not dropped]
     instability = worst_instability(checked, after, config)

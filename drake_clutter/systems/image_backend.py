@@ -1,4 +1,4 @@
-"""Backend without an arm whose observations come from rendered images."""
+"""Exploration backend without an arm, with observations from rendered images."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -29,8 +29,8 @@ from drake_clutter.tasks.episode import SteppedBackend
 class ImageBackend(SteppedBackend):
     """Detect objects in rendered images, teleport the picked one, and let Drake settle the scene.
 
-    Detections have names of their own. The object that is picked is the true one nearest to the
-    detection, and its placement has the detection's pose error.
+    Names of detections differ from those of the true objects. A command picks the true object
+    nearest to the detection, and the pose error of the detection carries over to the placement.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class ImageBackend(SteppedBackend):
 
         Args:
             scene: Objects at rest.
-            perceive: Detector.
+            perceive: Returns the detections in an image.
             seed: Seed of all random numbers.
             config: Config of the cell, the simulation and the task.
         """
@@ -80,7 +80,7 @@ class ImageBackend(SteppedBackend):
         return self._perceive(images.depth, images.color, ())
 
     def execute(self, command: PickPlaceCommand, rng: np.random.Generator) -> Outcome:
-        """Carry out a command with the true object nearest to its pick pose."""
+        """Execute a command with the true object nearest to its pick pose."""
         picked = nearest_object(self.scene.objects, command.X_TO_pick)
         X_TO_place = transport_pose(command.X_TO_pick, command.X_TO_place, picked.X_TO)
         move = replace(command.move, pick=picked.name)
@@ -92,12 +92,12 @@ class ImageBackend(SteppedBackend):
         return MoveResult.PLACED
 
     def to_ground_truth(self, decision: Decision) -> Decision:
-        """Return a decision in the names of the true objects."""
+        """Return a decision with the names of the true objects."""
         return to_ground_truth_names(
             decision, self.belief.objects, self.observation, self.scene.objects
         )
 
 
 def _unloaded_objects(known: Sequence[SceneObject]) -> set[str]:
-    """Return the names of objects on which nothing rests."""
+    """Return the names of the objects that carry no other object."""
     return {o.name for o in known if not objects_resting_on(o, known)}

@@ -75,10 +75,10 @@ class PerceptionSystem(LeafSystem):
     """
 
     def __init__(self, *, perceive: PerceptionFn, camera: Camera) -> None:
-        """Make a system.
+        """Create the system.
 
         Args:
-            perceive: Detector.
+            perceive: Returns the detections in an image.
             camera: Camera of the images.
         """
         super().__init__()
@@ -113,10 +113,10 @@ class PerceptionSystem(LeafSystem):
 
 
 class LearnedPerception:
-    """Learned detector that sees images with a depth camera's noise (a `PerceptionFn`)."""
+    """Learned detector on images with the noise of a depth camera (a `PerceptionFn`)."""
 
     def __init__(self, detect: DetectorFn, *, noise: DepthNoise | None, seed: int) -> None:
-        """Make a detector.
+        """Create a detector.
 
         Args:
             detect: Detector of objects in noisy images.
@@ -148,7 +148,7 @@ class LabelPerception:
     """
 
     def __init__(self, scene: Scene, station: ClutterStation, config: ClutterConfig) -> None:
-        """Make a detector.
+        """Create a detector.
 
         Args:
             scene: Scene whose objects are detected.

@@ -1,4 +1,4 @@
-"""Drake system that plans the moves which the policy requests."""
+"""Drake system that plans the moves that a policy requests."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ REQUEST_POLL_PERIOD = 0.05
 
 
 class PlannerSystem(LeafSystem):
-    """Plan one requested move after the other.
+    """Plan requested moves, one at a time.
 
     .. pydrake_system::
 
@@ -41,12 +41,12 @@ class PlannerSystem(LeafSystem):
     def __init__(
         self, *, planner: PickPlacePlanner, empty_depth: NDArray[np.float32], latency: float
     ) -> None:
-        """Make a system.
+        """Create the system.
 
         Args:
             planner: Planner of pick-and-place moves.
-            empty_depth: Depth image of the cell without objects [m], from which occluded space
-                follows. Shape (H, W).
+            empty_depth: Depth image of the cell without objects, for the occluded space [m]. Shape
+                (H, W).
             latency: Simulated time from a request to its response [s], independent of the
                 computation time.
         """

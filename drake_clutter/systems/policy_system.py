@@ -95,7 +95,7 @@ class PolicySystem(LeafSystem):
         action_filter: ActionFilter | None = None,
         post_motion_wait: float = 0.5,
     ) -> None:
-        """Make a system.
+        """Create the system.
 
         Args:
             config: Config of the task.
@@ -170,7 +170,7 @@ class PolicySystem(LeafSystem):
 
         Args:
             now: State before the observation.
-            observation: What the detector sees.
+            observation: Latest observation.
         """
         assert self.policy is not None, "set the policy before the simulation"
         belief, observation = update_belief(now.belief, observation, self._tracker)

@@ -60,7 +60,7 @@ def make_perception(scenario: Scenario, support: Support) -> PerceptionFn | None
 
     Args:
         scenario: The scenario.
-        support: What the objects of the scene stand on.
+        support: Support of the objects.
 
     Returns:
         The detector; None for ground-truth labels.

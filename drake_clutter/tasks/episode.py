@@ -98,7 +98,7 @@ class Detector(Protocol):
     """A perfect detector."""
 
     def perceive(self, scene: Scene) -> PerceptionResult:
-        """Return what the camera shows of a scene."""
+        """Return an observation of a scene."""
 
 
 class SteppedBackend:

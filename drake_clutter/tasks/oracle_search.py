@@ -1,6 +1,6 @@
 """Oracle search: the shortest sequence of moves that reveals every object of a known scene.
 
-The search knows the true scene, but is restricted to the moves of an explorer: it picks objects in
+The search has access to the true scene, but only to the moves of an explorer: it picks objects in
 view. Its plans bound what exploration policies can achieve, and it decides whether a scene that
 hides objects is solvable.
 """
