@@ -5,7 +5,7 @@
 from .files import InputError as InputError
 from .resources import resource_path as resource_path
 
-# Objects, scenes and files of scenes.
+# Objects and scenes.
 from .assets.asset_builder import build_assets as build_assets
 from .catalog import (
     Catalog as Catalog,
@@ -35,7 +35,7 @@ from .cell.work_cell import (
 )
 from .robots.robot_model import RobotModel as RobotModel, load_robot as load_robot
 
-# Judges: is a scene stable, and what does the camera see of it?
+# Scene judges.
 from .scenes.interfaces import SceneJudge as SceneJudge, Verdict as Verdict
 from .simulation.hybrid import HybridJudge as HybridJudge
 from .simulation.drake_judge import DrakeJudge as DrakeJudge
@@ -70,7 +70,7 @@ from .tasks.oracle_search import OracleSearch as OracleSearch
 from .agents.backend_factory import make_backend_factory as make_backend_factory
 from .agents.explorers import make_policy_factory as make_policy_factory
 
-# The arm: plans and their simulation.
+# Motion planning and arm simulation.
 from .planning.pick_place_plan import (
     PickPlacePlan as PickPlacePlan,
     PlanningFailure as PlanningFailure,

@@ -45,11 +45,11 @@ class DetectorTrainingConfig:
         images: Folder that `render_image_dataset.py` wrote.
         held_out: Number of images, the last of the folder, that are only used for evaluations.
         objects: Name of the object set.
-        catalog: Folder of a catalog with further object classes; "" for none.
+        catalog: Folder with additional object classes; "" for none.
         use_color: Whether the network sees color besides depth.
         warm_start: Checkpoint whose weights the training starts from; "" for random weights. It may
             have other object classes, and no color.
-        seed: Seed. The same seed gives the same weights on the same kind of machine.
+        seed: Random seed; equal seeds give equal weights on the same kind of machine.
         evaluate_every: Steps between two evaluations.
         learning: Hyperparameters of the training.
         cell: Work cell, whose camera and support the images show.

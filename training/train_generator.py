@@ -55,8 +55,8 @@ class GeneratorTrainingConfig:
 
     Attributes:
         objects: Name of the object set.
-        catalog: Folder of a catalog with further object classes; "" for none.
-        seed: Seed. The same seed gives the same weights on the same kind of machine.
+        catalog: Folder with additional object classes; "" for none.
+        seed: Random seed; equal seeds give equal weights on the same kind of machine.
         warm_start: Checkpoint whose weights the training starts from; "" for random weights.
         evaluate_every: Steps between two evaluations.
         evaluation_scenes: Number of scenes that an evaluation samples.

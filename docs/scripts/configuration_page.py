@@ -24,8 +24,9 @@ ROOTS: tuple[tuple[str, str, type], ...] = (
     (
         "World and work cell",
         "Fields of `--config` files, and of `--set`: `layout.stack_gap=0.02`, `robot.base.z=0.4`. "
-        "A file holds the fields that differ from the defaults; those of the cell stand below "
-        "`cell`. A [cell file](cell_file.md) holds a complete `WorkCell`.",
+        "A config file contains the fields that differ from the defaults; fields of the cell are "
+        "nested in `cell`. `--set` omits `cell` and addresses components of a pose by `x`, `y`, "
+        "`z`, `roll`, `pitch` and `yaw`. A [cell file](cell_file.md) contains a whole `WorkCell`.",
         ClutterConfig,
     ),
     (
@@ -39,7 +40,11 @@ ROOTS: tuple[tuple[str, str, type], ...] = (
         "`training/configs/sg_star.yaml` is an example.",
         GeneratorTrainingConfig,
     ),
-    ("Training of a teacher, fine-tuning", "", PPOTrainingConfig),
+    (
+        "Training of an explorer by PPO",
+        "For teachers, and for the fine-tuning of students.",
+        PPOTrainingConfig,
+    ),
     ("Training of a student by cloning", "", DAggerTrainingConfig),
     ("Training of a detector", "", DetectorTrainingConfig),
 )

@@ -62,14 +62,14 @@ _NAMES = (
     ("LF-clear", "largest-clear", "largest visible object with a clear top, to the tray"),
     ("SE^r", "student-rg", "student cloned (DAgger) on RG scenes"),
     ("SE\\*, DAgger", "student-dagger", "student cloned (DAgger) on SG\\* scenes"),
-    ("SE\\*", "student", "the same, fine-tuned"),
+    ("SE\\*", "student", "`student-dagger`, fine-tuned by PPO"),
     ("SE-14", "student-14", "student cloned and fine-tuned on SG-14 scenes"),
-    ("oracle", "full-knowledge", "search with full state"),
+    ("oracle", "full-knowledge", "search with full state for the fewest moves"),
 )
 """Short name, name on the command line and description of each policy."""
-_SUCCESS = ["dataset", "policy", "episodes", "success in 10", "paper", "success in 20"]
+_SUCCESS = ["dataset", "policy", "episodes", "success in 10", "in 10 (paper)", "success in 20"]
 _SUCCESS += ["of the solvable", "collapsed"]
-_FOUND = ["dataset", "policy", "hidden", "found in 10", "paper", "found in 20"]
+_FOUND = ["dataset", "policy", "hidden", "found in 10", "in 10 (paper)", "found in 20"]
 _FOUND += ["fraction found", "moves", "moves / oracle", "moves / LF-clear"]
 
 
@@ -120,7 +120,7 @@ def _policies() -> str:
         "Success rates",
         "Policies on frozen scene datasets with perfect detections; Drake settles every move. "
         "*Success*: every object detected within 10 or 20 moves. *Of the solvable*: success in 20 "
-        "moves on the scenes that the oracle search solves. *Paper*: Tables II and III of Kumar "
+        "moves on the scenes that the oracle search solves. *(Paper)*: Tables II and III of Kumar "
         "et al. 2022. Intervals are 95 %.",
         command="python training/evaluate_explorers.py runs/table2",
         seed=2000,

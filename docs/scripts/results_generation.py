@@ -87,24 +87,25 @@ def _scenes() -> str:
     text = section(
         "Scenes judged by Drake",
         "Drake settles every scene; the camera's label image decides which objects are hidden. "
-        "Graphs with a stack above 0.5 m or without room on the tray are drawn again. "
+        "Graphs with a stack above 0.5 m or without room on the tray are replaced. "
         "*Stable* is a fraction of the laid-out scenes; *hidden* (objects per scene) and "
-        "*solvable* (by the oracle search) are of the stable scenes. *Paper*: Table I of "
-        "Kumar et al. 2022. SG\\* is sampled at temperature 0.28, *paper reward* at 0.25. "
-        "Intervals are 95 %.",
+        "*solvable* (by the oracle search) are of the stable scenes. *(Paper)*: Table I of "
+        "Kumar et al. 2022. *SG\\*, paper reward*: trained with the paper's reward, sampled at "
+        "temperature 0.25; the other SG\\* at 0.28. Intervals are 95 %.",
         command="python training/evaluate_generators.py runs/table1",
         seed=1000,
         results=["training/results/table1.json"],
     )
-    head = ["generator", "objects", "nodes", "scenes", "stable", "paper", "hidden", "paper"]
+    head = ["generator", "objects", "nodes", "scenes", "stable", "stable (paper)"]
+    head += ["hidden", "hidden (paper)"]
     text += table([*head, "solvable"], [_success_row(row, generator_name(row)) for row in own])
     text += _seed_sentence(own)
     text += (
         "### Diversity\n\n"
         "*Laid out*: fraction of the derived graphs. *Distinct*: fraction of distinct graphs. "
         "*Balanced*: no stack holds more than 60 % of the objects. *Class entropy*: of the object "
-        "classes [bits]. *False stable*: fraction of the scenes called stable by the static judge "
-        "(margin 2.05 mm) that fall in Drake.\n\n"
+        "classes [bits]. *False stable*: fraction of the scenes that the static judge "
+        "(margin 2.05 mm) judges stable and Drake unstable.\n\n"
     )
     head = ["generator", "objects", "nodes", "laid out", "distinct", "stacks", "balanced"]
     head += ["class entropy", "false stable"]
