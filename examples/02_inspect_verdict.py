@@ -1,4 +1,4 @@
-"""Build scenes object by object and compare what the two judges say of them."""
+"""Build scenes object by object and compare the verdicts of two judges."""
 
 import numpy as np
 
@@ -40,8 +40,8 @@ def main() -> None:
         print(title)
         for name, judge in judges.items():
             verdict = judge.judge(scene, np.random.default_rng(0))
-            if not isinstance(verdict, Verdict):
-                print(f"  {name}: cannot judge: {verdict}")
+            if not isinstance(verdict, Verdict):  # the static judge is inconclusive
+                print(f"  {name}: inconclusive: {verdict}")
             elif verdict.instability is not None:
                 print(f"  {name}: unstable: {verdict.instability}")
             else:

@@ -1,4 +1,4 @@
-"""Count which moves an arm can make in scenes, from two places of its base, in parallel."""
+"""Compare two base positions of an arm by the moves that it can execute, in parallel."""
 
 import argparse
 from collections import Counter
@@ -21,7 +21,7 @@ BASES = (-0.75, -1.25)
 
 
 def count_results(base_x: float, index: int) -> Counter[str]:
-    """Return how often each result occurs among the legal moves of a scene."""
+    """Count the planning results of the legal moves in a scene."""
     config = ClutterConfig()
     robot = config.cell.robot
     base = robot.base.model_copy(update={"translation": (base_x, 0.0, 0.3)})
@@ -42,7 +42,7 @@ def main(count: int, workers: int) -> None:
             print(f"base at x = {base_x} m: {results.total()} moves: {counts}")
 
 
-# Worker processes import this file: without the guard, each would start a study of its own.
+# Worker processes import this file; the guard keeps them from running `main`.
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=10, help="number of scenes")

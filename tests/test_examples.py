@@ -1,4 +1,4 @@
-"""Every script of `examples/` runs, as a user runs it, on a small case."""
+"""The scripts in `examples/` run as programs, with options for a short run."""
 
 import os
 import re
@@ -20,10 +20,12 @@ CASES = {
     "07_feasibility_study": ["--count", "1", "--workers", "1"],
     "08_add_object_class": ["--nodes", "6"],
 }
-"""Options of the scripts that make the case small."""
+"""Options for a short run of each script."""
+TUTORIAL_SCRIPTS = list(CASES)[:4]
+"""Scripts whose output a tutorial shows."""
 
 
-def test_every_script_is_run() -> None:
+def test_cases_contain_every_script() -> None:
     assert sorted(path.stem for path in (ROOT / "examples").glob("*.py")) == sorted(CASES)
 
 
@@ -50,7 +52,10 @@ def test_script_runs(name: str, tmp_path: Path) -> None:
 
 
 def shown_output(name: str) -> list[str]:
-    """Return the lines that a tutorial shows as the output of the case, without their numbers."""
+    """Return the output of a script that a tutorial shows, with 0 for all numbers.
+
+    The list is empty if no tutorial shows the output.
+    """
     command = shlex.join(["python", f"examples/{name}.py", *CASES[name]])
     for page in (ROOT / "docs/tutorials").glob("*.md"):
         _, found, rest = page.read_text(encoding="utf-8").partition(f"\n$ {command}\n")
@@ -66,7 +71,7 @@ def without_numbers(line: str) -> str:
 
 
 def test_tutorials_show_the_output_of_scripts() -> None:
-    assert [name for name in CASES if shown_output(name)] == list(CASES)[:4]
+    assert [name for name in CASES if shown_output(name)] == TUTORIAL_SCRIPTS
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -74,6 +79,6 @@ def test_script_is_short(name: str) -> None:
     assert len((ROOT / "examples" / f"{name}.py").read_text().splitlines()) < 60
 
 
-def test_every_script_is_on_a_page() -> None:
+def test_every_script_is_included_in_a_page() -> None:
     pages = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs").rglob("*.md"))
     assert [name for name in CASES if f'\n--8<-- "examples/{name}.py"\n' not in pages] == []

@@ -41,7 +41,7 @@ def test_a_failed_write_leaves_no_file(tmp_path: Path) -> None:
         with atomic_write(tmp_path / "a.png") as temporary:
             assert temporary.parent == tmp_path
             assert temporary.suffix == ".png"
-            temporary.write_text("half")
+            temporary.write_text("incomplete")
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -97,7 +97,7 @@ def test_prepare_output_directory_rejects_a_file(tmp_path: Path) -> None:
             prepare_output_directory(path)
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write to any folder")
 def test_prepare_output_directory_rejects_a_folder_that_is_not_writable(tmp_path: Path) -> None:
     locked = tmp_path / "locked"
     locked.mkdir(mode=0o500)

@@ -16,14 +16,19 @@ ON_TOP = resting("tomato_soup_can", xy=(0.03, 0.02), floor=BOX.top_height)
 BESIDE = resting("gelatin_box", xy=(0.2, 0.1))
 
 
+MIN_VISIBLE_FRACTION = 0.2
+
+
 def select(
-    true: list[SceneObject], hypotheses: list[SceneObject], scores: list[float] | None = None
+    true_objects: list[SceneObject],
+    hypotheses: list[SceneObject],
+    scores: list[float] | None = None,
 ) -> list[int]:
-    depth = LabelDetector(CAMERA).perceive(scene_of(*true)).observation.depth
+    """Return the indices of the hypotheses that are selected in a scene of true objects."""
+    depth = LabelDetector(CAMERA).perceive(scene_of(*true_objects)).observation.depth
     evidence = [evaluate_pose(o.object_class, o.X_TO, depth, CAMERA) for o in hypotheses]
-    return sorted(
-        select_consistent_poses(evidence, scores or [0.8] * len(hypotheses), depth.shape, 0.2)
-    )
+    scores = scores or [0.8] * len(hypotheses)
+    return sorted(select_consistent_poses(evidence, scores, depth.shape, MIN_VISIBLE_FRACTION))
 
 
 def test_all_true_poses_are_selected() -> None:
@@ -34,24 +39,24 @@ def test_evidence_agrees_with_the_label_image() -> None:
     observation = LabelDetector(CAMERA).perceive(scene_of(BOX, ON_TOP)).observation
     by_name = {d.name: d.mask for d in observation.detections}
     for o in (BOX, ON_TOP):
-        e = evaluate_pose(o.object_class, o.X_TO, observation.depth, CAMERA)
+        evidence = evaluate_pose(o.object_class, o.X_TO, observation.depth, CAMERA)
         mask = np.zeros(observation.depth.shape, bool)
-        mask[e.window] = e.consistent
-        either = np.count_nonzero(mask | by_name[o.name])
-        assert np.count_nonzero(mask & by_name[o.name]) > 0.93 * either
-    assert e.num_unoccluded_pixels > 0.97 * np.count_nonzero(e.consistent), (
-        "nothing occludes the can"
-    )
+        mask[evidence.window] = evidence.consistent
+        union = np.count_nonzero(mask | by_name[o.name])
+        assert np.count_nonzero(mask & by_name[o.name]) > 0.93 * union
+    num_consistent = np.count_nonzero(evidence.consistent)
+    assert evidence.num_unoccluded_pixels > 0.97 * num_consistent, "nothing occludes the can"
 
 
 def test_an_object_with_two_hypotheses_is_selected_once() -> None:
-    again = replace(BOX, X_TO=BOX.X_TO.translated((0.002, -0.001, 0.001)))
-    assert select([BOX], [again, BOX], [0.7, 0.9]) == [1]
+    inaccurate = replace(BOX, X_TO=BOX.X_TO.translated((0.002, -0.001, 0.001)))
+    assert select([BOX], [inaccurate, BOX], [0.7, 0.9]) == [1]
 
 
 def test_a_smaller_class_on_the_face_of_a_larger_object_is_rejected() -> None:
-    part = SceneObject("part", CLASSES["gelatin_box"], Pose((0.03, 0.0, BOX.top_height - 0.014)))
-    assert select([BOX], [part, BOX]) == [1]
+    pose = Pose((0.03, 0.0, BOX.top_height - 0.014))
+    smaller = SceneObject("smaller", CLASSES["gelatin_box"], pose)
+    assert select([BOX], [smaller, BOX]) == [1]
 
 
 def test_poses_with_free_space_violations_are_rejected() -> None:
