@@ -1,9 +1,10 @@
 """The catalog of object classes: sizes, masses, labels and asset folders.
 
 An *asset folder* holds `catalog.yaml` and one folder for each class, which `drake_clutter.assets`
-builds from it. The shipped one is `sdf_assets/`; a user's own adds classes to it. The origin of an
-object's frame O is the geometric center. A box's x, y and z axes are its sizes in the order of the
-catalog, a cylinder's axis is z, and a mesh keeps its axes.
+builds from it. The shipped asset folder is `sdf_assets/`; a user's asset folder adds classes to it.
+
+The origin of an object's frame O is the geometric center. A box's x, y and z axes are its sizes in
+the order of the catalog, a cylinder's axis is z, and a mesh keeps its axes.
 """
 
 import math
@@ -30,10 +31,13 @@ CATALOG_FILE = "catalog.yaml"
 _EARLIER_CATALOG_FILE = "catalogue.yaml"
 """Name of a catalog in asset folders that were made before version 0.2."""
 _PRISM_SIDES = 32
+"""Number of sides of the prism that represents a cylinder in `convex_pieces`."""
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 _EMPTY_MAPPING: Any = Field(default_factory=dict)
 _Size = Annotated[float, InRange(3, 1000)]
+"""An extent of an object [mm]."""
 _RESERVED_NAMES = frozenset({"tray", "object_slot", "open_slot", "end", "dummy"})
+"""Names of the support and of nodes of the scene grammar."""
 
 
 class Shape(Enum):
@@ -45,7 +49,7 @@ class Shape(Enum):
 
 
 class RestOrientation(Enum):
-    """Which axis points up when an object rests, by the extent along it.
+    """Vertical axis of an object at rest, by the rank of the extent along the axis.
 
     A mesh keeps its own axes: x counts as the shortest and z as the longest.
     """
@@ -79,7 +83,7 @@ class LabelDesign(StrictModel):
 
 
 def _check_class_name(name: str) -> str:
-    """Return a valid name of a class."""
+    """Validate the name of a class."""
     if not _NAME.fullmatch(name) or name in _RESERVED_NAMES:
         words = ", ".join(sorted(_RESERVED_NAMES))
         raise allowed_error(f"a name of lower-case letters, digits and _, and none of {words}")
@@ -87,16 +91,16 @@ def _check_class_name(name: str) -> str:
 
 
 class ClassEntry(StrictModel):
-    """One class as it stands in `catalog.yaml`.
+    """One class in `catalog.yaml`.
 
     Attributes:
         shape: Box, cylinder or mesh.
         size_mm: Extents [mm]; diameter, diameter, height of a cylinder. A mesh's are measured and
             must be left out. Shape (3,).
         mass_g: Mass [g].
-        source: Where size and mass come from.
+        source: Source of size and mass.
         pairs: Arrangements in which two objects of the class stand as a pair.
-        only_rest: The one way in which it rests (cans stand, a marker lies), or None if it varies.
+        only_rest: Only orientation at rest (cans stand, a marker lies); None if it varies.
         mesh: Path of a watertight mesh in meters, relative to the catalog; for shape mesh only.
         label: How its texture is drawn.
     """
@@ -160,9 +164,9 @@ class ObjectClass:
         size: Extents of the bounding box in O [m]; (diameter, diameter, height) of a cylinder.
             Shape (3,).
         mass: Mass [kg].
-        source: Where size and mass come from.
+        source: Source of size and mass.
         pairs: Pair arrangements for which the grammar has a rule.
-        only_rest: The one way in which it rests, or None if it varies.
+        only_rest: Only orientation at rest; None if it varies.
         mesh: The user's mesh file, or None.
         label: How its texture is drawn.
         folder: Folder of its built assets.
@@ -191,8 +195,8 @@ class ObjectClass:
         return self.folder / "model.sdf"
 
     @cached_property
-    def model_path(self) -> Path:
-        """Path of the built SDF model, whose mass equals the catalog's.
+    def verified_sdf_path(self) -> Path:
+        """Path of the built SDF model, after a check of its mass against the catalog.
 
         Raises:
             InputError: The model is missing, or was built with another mass.
@@ -279,10 +283,10 @@ def _measure_mesh(path: Path, where: str) -> tuple[float, float, float]:
         InputError: The mesh cannot be read, is not watertight, or has an unsuitable size.
     """
     if not path.is_file():
-        raise InputError(f"{where}.mesh: no file {path}; give a mesh that lies beside the catalog")
+        raise InputError(f"{where}.mesh: no file {path}; give a path relative to the catalog")
     try:
         mesh = trimesh.load_mesh(path)
-    except Exception as error:  # trimesh's readers raise whatever their formats suggest
+    except Exception as error:  # trimesh raises exceptions of many types
         raise InputError(f"{where}.mesh: {path} cannot be read as a mesh ({error})") from error
     if not isinstance(mesh, trimesh.Trimesh) or not mesh.is_watertight or mesh.volume <= 0:
         raise InputError(
@@ -332,7 +336,7 @@ def load_catalog(folder: Path | None = None) -> Catalog:
     """Return the shipped catalog, extended by a user's asset folder.
 
     Args:
-        folder: A user's asset folder, or None for the shipped one alone.
+        folder: A user's asset folder; None for the shipped catalog alone.
 
     Raises:
         InputError: A catalog is missing or invalid. The message names file, field and what is
@@ -347,8 +351,8 @@ def load_catalog(folder: Path | None = None) -> Catalog:
     for asset_folder in folders:
         path = catalog_path(asset_folder)
         if not path.is_file():
-            allowed_values = f"no such file; a catalog is a folder that holds {CATALOG_FILE}"
-            raise input_error(str(path), allowed_values)
+            problem = f"no such file; an asset folder contains {CATALOG_FILE}"
+            raise input_error(str(path), problem)
         catalog_file = validate(CatalogFile, read_yaml(path, "a catalog"), str(path))
         for name, entry in catalog_file.classes.items():
             if name in classes:

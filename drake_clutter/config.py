@@ -1,4 +1,7 @@
-"""Configuration of the simulated world. `docs/` discusses the default values."""
+"""Configuration of the simulated world.
+
+`docs/explanation` states the reasons for the default values.
+"""
 
 from collections.abc import Sequence
 from dataclasses import field
@@ -21,11 +24,11 @@ from drake_clutter.validation import (
 @config_class
 @renamed_fields(placement_tries="placement_attempts")
 class LayoutConfig:
-    """How a terminal graph becomes poses on the support.
+    """Layout of a terminal graph: the poses of its objects on the support.
 
     Attributes:
         stack_gap: Smallest distance between the footprints of two stacks, and between a stack and
-            the rim [m].
+            the edge of the support [m].
         max_stack_height: A graph with a higher stack is rejected [m].
         lying_gap: Distance between the two objects of a lying pair [m].
         standing_gap: Distance between the two objects of a standing pair [m].
@@ -65,7 +68,7 @@ class SettleConfig:
             `max_time` is not at rest [m]. Contact chatter and the rocking of a cylinder on the
             facets of its contact mesh stay below the default.
         early_stop_speed: A sample counts as calm when every object is slower than this [m/s] and
-            within the next two limits.
+            within `early_stop_displacement` and `early_stop_tilt_deg`.
         early_stop_displacement: Largest displacement since the start in a calm sample [m].
         early_stop_tilt_deg: Largest rotation since the start in a calm sample [deg].
         early_stop_samples: Consecutive calm samples, 0.05 s apart, that end the simulation.
@@ -89,7 +92,7 @@ class SettleConfig:
 
 @config_class
 class ExplorationConfig:
-    """The exploration task.
+    """Moves, rewards and placements of the exploration task.
 
     Attributes:
         max_moves: Moves after which an episode is truncated.
@@ -109,12 +112,12 @@ class ExplorationConfig:
 
 @config_class
 class ClutterConfig:
-    """The whole simulated world.
+    """Configuration of the simulated world.
 
     Attributes:
-        layout: How a graph becomes poses.
+        layout: Layout of a terminal graph.
         settle: How scenes settle and what counts as stable.
-        exploration: The exploration task.
+        exploration: Moves, rewards and placements of the exploration task.
         cell: Robot, gripper, support, cameras and fixtures.
     """
 
@@ -125,16 +128,20 @@ class ClutterConfig:
 
 
 def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> ClutterConfig:
-    """Return the simulated world; see `load_config_as`."""
+    """Load the configuration of the simulated world; see `load_config_as`."""
     return load_config_as(ClutterConfig(), path, settings, upgrade_config)
 
 
-def upgrade_config(given: Any) -> Any:
-    """Return a config document of version 0.1 with camera, tray and arm in its cell."""
-    if not isinstance(given, dict):
-        return given
+def upgrade_config(document: Any) -> Any:
+    """Upgrade a config document of version 0.1: camera, tray and arm move into the cell.
+
+    Args:
+        document: Content of a config file; returned unchanged if it is not a mapping.
+    """
+    if not isinstance(document, dict):
+        return document
     upgraded = {
-        key: value if key == "cell" else upgrade_config(value) for key, value in given.items()
+        key: value if key == "cell" else upgrade_config(value) for key, value in document.items()
     }
     cell: dict[str, Any] = {}
     if isinstance(camera := upgraded.get("camera"), dict):
@@ -145,45 +152,45 @@ def upgrade_config(given: Any) -> Any:
         cell["support"] = {"size": [layout["tray_side"]] * 2}
     if isinstance(arm := upgraded.get("arm"), dict):
         del upgraded["arm"]
-        upgraded["world"] = _merge_over({"cell": upgrade_cell(arm)}, upgraded.get("world", {}))
+        upgraded["world"] = _deep_merge({"cell": upgrade_cell(arm)}, upgraded.get("world", {}))
     if "camera_noise" in upgraded:
         noise = {"overhead": {"depth_noise": upgraded.pop("camera_noise")}}
-        upgraded["world"] = _merge_over({"cell": {"cameras": noise}}, upgraded.get("world", {}))
+        upgraded["world"] = _deep_merge({"cell": {"cameras": noise}}, upgraded.get("world", {}))
     if cell:
-        upgraded["cell"] = _merge_over(cell, upgraded.get("cell", {}))
+        upgraded["cell"] = _deep_merge(cell, upgraded.get("cell", {}))
     return upgraded
 
 
-def _merge_over(base: Any, given: Any) -> Any:
-    """Return `base` with the entries of `given` over its own."""
-    if not isinstance(given, dict) or not isinstance(base, dict):
-        return given
-    return {**base, **{key: _merge_over(base.get(key), value) for key, value in given.items()}}
+def _deep_merge(base: Any, overrides: Any) -> Any:
+    """Return `base`, updated recursively with the entries of `overrides`."""
+    if not isinstance(overrides, dict) or not isinstance(base, dict):
+        return overrides
+    return {**base, **{key: _deep_merge(base.get(key), value) for key, value in overrides.items()}}
 
 
-def upgrade_header_configs(given: Any) -> Any:
-    """Return the header of a results file of version 0.1 in the form of this version.
+def upgrade_header_configs(header: Any) -> Any:
+    """Upgrade the header of a results file of version 0.1.
 
-    Configs in it get the current names of fields, and complete cells instead of cameras and arms.
+    Its configs get the current names of fields, and complete cells instead of cameras and arms.
     """
-    return _complete_configs(upgrade_config(given))
+    return _complete_configs(upgrade_config(header))
 
 
-def _complete_configs(given: Any) -> Any:
+def _complete_configs(document: Any) -> Any:
     """Return a document with current names of fields and complete cells."""
-    if not isinstance(given, dict):
-        return given
-    completed = {key: _complete_configs(value) for key, value in given.items()}
+    if not isinstance(document, dict):
+        return document
+    completed = {key: _complete_configs(value) for key, value in document.items()}
     for key, schema in (("layout", LayoutConfig), ("settle", SettleConfig)):
         if key in completed:
             completed[key] = with_current_names(schema, completed[key])
-    if isinstance(cell := given.get("cell"), dict):
+    if isinstance(cell := document.get("cell"), dict):
         completed["cell"] = to_plain(override_config(default_cell(), cell, "cell"))
     return completed
 
 
 def _upgrade_camera(old: dict[str, Any]) -> dict[str, Any]:
-    """Return a camera's document of version 0.1 in the form of this version."""
+    """Upgrade the document of a camera of version 0.1."""
     camera = {key: value for key, value in old.items() if key not in ("altitude", "hidden_below")}
     if "altitude" in old:
         camera["pose"] = {"translation": [0.0, 0.0, old["altitude"]], "rpy_deg": [180.0, 0.0, 0.0]}
@@ -193,9 +200,9 @@ def _upgrade_camera(old: dict[str, Any]) -> dict[str, Any]:
 
 
 def upgrade_cell(old: Any) -> Any:
-    """Return a cell's document with the arm of version 0.1 as robot and gripper.
+    """Upgrade the document of an arm of version 0.1 to robot and gripper of a cell.
 
-    Version 0.1 has the fields `base`, `home`, `suction` and `payload`.
+    The fields of version 0.1 are `base`, `home`, `suction` and `payload`.
     """
     if not isinstance(old, dict):
         return old

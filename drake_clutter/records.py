@@ -56,10 +56,10 @@ def resume_jsonl(
 
     Args:
         path: The file; created, with its folders, if it does not exist.
-        header: Everything that determines the records. The file's header also holds the `commit`
+        header: All parameters that determine the records. The file's header also holds the `commit`
             at which the file was created.
         make_records: Receives the number of records in the file; yields those that follow.
-        upgrade_header: Converts a header written by an earlier version to the current form.
+        upgrade_header: Converts a header written by an earlier version to the current format.
 
     Raises:
         InputError: The file has another header, or another process is appending to it.

@@ -167,9 +167,7 @@ def test_a_catalog_under_its_earlier_file_name(tmp_path: Path) -> None:
 
 
 def test_no_catalog(tmp_path: Path) -> None:
-    with pytest.raises(
-        InputError, match=r"no such file; a catalog is a folder that holds catalog\.yaml"
-    ):
+    with pytest.raises(InputError, match=r"no such file; an asset folder contains catalog\.yaml"):
         load_catalog(tmp_path)
 
 

@@ -1,4 +1,4 @@
-"""Checkpoints, training states and run folders of version 0.1 load under today's names."""
+"""Checkpoints, training states and run folders of version 0.1 load under the current names."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace

@@ -104,7 +104,7 @@ def test_misuse_is_reported_before_any_episode_is_run(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=message):
             script.main(tmp_path / "episodes", only="sg_14", count=1, agents=agents, out=out)
     out.write_text('{"rows": []}')
-    with pytest.raises(InputError, match=r"--out .*table\.json: is no results file \('seed'\)"):
+    with pytest.raises(InputError, match=r"--out .*table\.json: is not a results file \('seed'\)"):
         script.main(tmp_path / "episodes", only="sg_14", count=1, agents=["random"], out=out)
     assert list((tmp_path / "episodes").iterdir()) == []
 
@@ -129,7 +129,7 @@ def test_an_explorer_is_compared_with_the_records_of_a_baseline(tmp_path: Path) 
 
 @pytest.mark.parametrize("name", [*script.YCB7_SETS, *script.PANTRY14_SETS])
 def test_published_episodes_are_resumed(name: str, tmp_path: Path) -> None:
-    """The header of a record file of an earlier version is that of today."""
+    """The header of a record file of an earlier version is upgraded to the current header."""
     scenes = load_scene_dataset(SCENES / f"{name}.json", CATALOG)
     for agent in script.TABLES[name][1]:
         path = script.episodes_path(script.EPISODES, name, agent)

@@ -228,7 +228,7 @@ def collect_episodes(
 
 
 def upgrade_scenario(header: Any) -> Any:
-    """Return the header of a record file of an earlier version with today's names of fields."""
+    """Upgrade the header of a record file of an earlier version to the current names of fields."""
     header = upgrade_header_configs(header)
     scenario = to_plain(override_config(Scenario(), header["scenario"], "scenario"))
     scenario.pop("seed")

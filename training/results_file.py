@@ -1,8 +1,8 @@
 """Results files and record files of the scripts in `training/` and `benchmarks/`.
 
 A results file is a JSON document: what its rows have in common (seed, configuration, ...), and
-`rows`, one for each measured combination. A record file (`drake_clutter.records`) holds the single
-episodes or scenes that a row summarizes.
+`rows`, one for each measured combination. A record file (`drake_clutter.records`) holds the
+individual episodes or scenes that a row summarizes.
 """
 
 import json
@@ -32,7 +32,7 @@ def provenance() -> dict[str, str]:
 
 
 def upgrade_record_header(header: Any) -> Any:
-    """Return the header of a file of an earlier version with today's names of fields."""
+    """Upgrade the header of a file of an earlier version to the current names of fields."""
     upgraded = upgrade_header_configs(header)
     if isinstance(upgraded, dict) and "fidelity" in upgraded:
         upgraded["fidelity"] = current_fidelity(upgraded["fidelity"])
@@ -57,7 +57,7 @@ class ResultsFile:
         """Return the rows in the file; an empty list if there is no file.
 
         Raises:
-            InputError: The file is no results file, or has another header.
+            InputError: The file is not a results file, or has another header.
         """
         try:
             document = upgrade_record_header(json.loads(self.path.read_text(encoding="utf-8")))
@@ -67,7 +67,7 @@ class ResultsFile:
             return []
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(
-                f"--out {self.path}: is no results file ({error}); expected one, or a new file"
+                f"--out {self.path}: is not a results file ({error}); expected one, or a new file"
             ) from error
         if differing:
             raise InputError(
@@ -77,11 +77,11 @@ class ResultsFile:
         return rows
 
     def find(self, row: Row) -> Row | None:
-        """Return the row in the file that shares the `keys` with a row; None if there is none."""
+        """Return the row in the file with the same `keys` as a row; None if there is none."""
         return self._by_key().get(self._key(row))
 
     def add(self, *rows: Row) -> None:
-        """Write rows into the file; each replaces the row that it shares the `keys` with."""
+        """Write rows into the file; rows in the file with the same `keys` are replaced."""
         merged = self._by_key() | {self._key(row): row for row in rows}
         self.path.parent.mkdir(parents=True, exist_ok=True)
         write_json(self.path, {**self.header, "rows": list(merged.values())})
@@ -104,18 +104,18 @@ def collect_records(
     max_items_per_process: int | None = None,
     upgrade: Callable[[Any], Any] = upgrade_record_header,
 ) -> list[Row]:
-    """Return the record of each item; those that a record file lacks are computed and appended.
+    """Return the records of items; records that the file lacks are computed and appended.
 
     Args:
         path: The record file. Its name is the label of the progress bar.
-        header: Everything that determines the records, see `resume_jsonl`.
+        header: All parameters that determine the records; see `resume_jsonl`.
         make_worker: See `map_ordered`. The worker returns an item's record, as a dictionary or a
             dataclass; `provenance` is added to it.
         items: All items, also those that are already in the file.
         workers: See `map_ordered`.
         ray_address: See `map_ordered`.
         max_items_per_process: See `map_ordered`.
-        upgrade: Converts the header of an earlier version to today's form.
+        upgrade: Converts the header of an earlier version to the current format.
     """
     software = provenance()
 

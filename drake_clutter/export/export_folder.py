@@ -63,7 +63,7 @@ def export_scene(scene: Scene, format: ExportFormat, out: Path) -> Path:
                 f"and no name that a format reserves ({reserved})"
             )
     for object_class in classes_in_scene(scene):
-        _ = object_class.model_path  # raises before anything is written
+        _ = object_class.verified_sdf_path  # raises before anything is written
     staging = out / f".export.{secrets.token_hex(4)}"
     staging.mkdir()
     try:

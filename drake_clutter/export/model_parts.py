@@ -78,7 +78,7 @@ def write_xml(path: Path, root: ElementTree.Element) -> None:
 
 def load_inertial(object_class: ObjectClass) -> Inertial:
     """Return the mass properties in the built model of a class."""
-    inertial = ElementTree.parse(object_class.model_path).find("model/link/inertial")
+    inertial = ElementTree.parse(object_class.verified_sdf_path).find("model/link/inertial")
     assert inertial is not None, f"{object_class.sdf_path} was not built by drake_clutter"
     moments = (
         float(inertial.findtext(f"inertia/{entry}", "nan"))

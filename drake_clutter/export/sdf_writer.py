@@ -68,7 +68,9 @@ def write_sdf(scene: Scene, folder: Path) -> Path:
     world.append(tray)
     for scene_object in scene.objects:
         object_class = scene_object.object_class
-        model = _model(object_class.model_path.read_text(encoding="utf-8"), scene_object.name)
+        model = _model(
+            object_class.verified_sdf_path.read_text(encoding="utf-8"), scene_object.name
+        )
         for uri in model.iter("uri"):
             # PyBullet reads no glTF.
             uri.text = f"{object_class.name}/{uri.text}".replace(".gltf", ".obj")

@@ -138,7 +138,7 @@ def add_objects(
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("tray", tray))
     bodies = {}
     for name, object_class in objects:
-        text = read_sdf_text(object_class.model_path, visuals=visuals)
+        text = read_sdf_text(object_class.verified_sdf_path, visuals=visuals)
         (instance,) = Parser(plant, model_name_prefix=name).AddModelsFromString(text, "sdf")
         bodies[name] = plant.GetBodyByName("body", instance)
         if (
