@@ -120,7 +120,7 @@ def test_infeasible_moves_have_a_reason() -> None:
 def test_larger_pose_errors_invalidate_more_plans() -> None:
     it = study()
     rows = it.plan_all_moves("scene", 0, SCENE)
-    found = it.test_pose_errors("scene", 0, SCENE, rows)
+    found = it.evaluate_pose_errors("scene", 0, SCENE, rows)
     planned = sum(row.result == PLANNED for row in rows)
     assert len(found) == 5 * min(6, planned)
     holds = [

@@ -90,9 +90,9 @@ def test_stable_scenes_have_a_solvability() -> None:
     made = [SceneGenerator(job(12))(index) for index in range(6)]
     assert {m.verdict.stable for m in made} == {True, False}
     for m in made:
-        assert (m.solvable is None) == (not m.verdict.stable)
+        assert (m.solvability is None) == (not m.verdict.stable)
         if m.verdict.stable and not m.verdict.hidden:
-            assert m.solvable is Solvability.SOLVABLE
+            assert m.solvability is Solvability.SOLVABLE
 
 
 def test_the_hill_climber_hides_more_objects_than_the_random_generator() -> None:

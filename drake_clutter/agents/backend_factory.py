@@ -23,7 +23,7 @@ def make_backend_factory(
 
     Args:
         fidelity: One of `FIDELITIES`.
-        config: The simulated world.
+        config: Configuration of the simulated world.
         simulate_collapse: See `make_teleport_backend_factory`. The arm's simulation always follows
             a collapse to its end.
 

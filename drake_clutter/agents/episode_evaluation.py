@@ -84,7 +84,7 @@ class EpisodeRunner:
         """Create a runner.
 
         Args:
-            config: The simulated world.
+            config: Configuration of the simulated world.
             catalog_folder: Folder with additional object classes, or None.
             max_moves: Maximum number of moves of an episode.
             seed: Seed of the evaluation.

@@ -17,7 +17,7 @@ from drake_clutter.tasks.episode import current_fidelity
 from drake_clutter.validation import InRange, config_class, renamed_fields
 
 CHECKPOINT_FILE = "explorer.safetensors"
-"""Name of the checkpoint that a training writes to its folder."""
+"""Name of the checkpoint that a training writes to its run folder."""
 
 
 @config_class
@@ -33,7 +33,7 @@ class ExplorerTrainingConfig:
         max_moves: Maximum number of moves of an episode.
         max_objects: Maximum number of objects of a scene.
         evaluation_episodes: Number of episodes of an evaluation.
-        world: The simulated world.
+        world: Configuration of the simulated world.
     """
 
     scenes: str = "training/scenes/train_sg_star.json"
@@ -49,7 +49,8 @@ class ExplorerTrainingConfig:
         """Create the environment.
 
         Args:
-            privileged: Whether observations show all objects as they are, instead of K_t.
+            privileged: Whether observations show all objects at their true poses, instead of the
+                belief K_t.
         """
         catalog = load_catalog(Path(self.catalog) if self.catalog else None)
         return ClutterExploration(
@@ -64,7 +65,7 @@ class ExplorerTrainingConfig:
     def evaluate(
         self, environment: ClutterExploration, network: ExplorerNetwork
     ) -> dict[str, float]:
-        """Return the metrics of a network's most probable moves, always on the same episodes."""
+        """Return the metrics of a network's most probable moves on a fixed set of episodes."""
         return episode_metrics(
             collect_rollouts(
                 environment,

@@ -145,7 +145,7 @@ def make_policy_factory(
     Args:
         name: One of `BASELINE_POLICIES`, one of `PRETRAINED_EXPLORERS`, `ORACLE`, or the file of a
             checkpoint.
-        config: The simulated world.
+        config: Configuration of the simulated world.
         classes: Names of the object classes that will occur, as far as they are known.
 
     Raises:

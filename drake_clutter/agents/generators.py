@@ -98,7 +98,7 @@ class HillClimber:
         """Create an agent.
 
         Args:
-            config: The simulated world.
+            config: Configuration of the simulated world.
         """
         self._config = config
         self._judge = StaticStabilityJudge(config, margin=GenerationTaskConfig().contact_margin)
@@ -135,7 +135,7 @@ def make_generation_agent(
     Args:
         name: `random`, `hill-climbing`, one of `PRETRAINED_GENERATORS`, or the file of a
             checkpoint.
-        config: The simulated world.
+        config: Configuration of the simulated world.
         temperature: Temperature of a trained agent's softmax; None selects that of its checkpoint.
 
     Raises:
@@ -166,7 +166,7 @@ def make_generation_agent(
 
 @dataclass(frozen=True)
 class GenerationJob:
-    """Everything that determines the scenes of a batch.
+    """All parameters that determine the scenes of a batch.
 
     Attributes:
         agent: See `make_generation_agent`.
@@ -174,7 +174,7 @@ class GenerationJob:
         catalog_folder: Folder with additional object classes, or None.
         nodes: Number of nodes of each graph.
         seed: Seed of the batch.
-        config: The simulated world.
+        config: Configuration of the simulated world.
         temperature: See `make_generation_agent`.
     """
 
@@ -201,16 +201,15 @@ class GeneratedScene:
     Attributes:
         scene: The scene as laid out.
         verdict: Verdict of the judge.
-        layout_failures: Number of graphs that were derived before and could not be laid out, by
+        layout_failures: Number of graphs, derived before this one, that could not be laid out, by
             reason.
-        solvable: Result of the oracle search for a stable scene, once settled; None for an
-            unstable one.
+        solvability: Result of the oracle search in the settled scene; None for an unstable scene.
     """
 
     scene: Scene
     verdict: Verdict
     layout_failures: Counter[str]
-    solvable: Solvability | None
+    solvability: Solvability | None
 
 
 class SceneGenerator:
@@ -230,17 +229,17 @@ class SceneGenerator:
         self._search = OracleSearch(job.config)
 
     def __call__(self, index: int) -> GeneratedScene:
-        """Generate and judge the scene of an index, which depends only on the job and the index."""
+        """Generate and judge a scene that depends only on the job and an index."""
         rng = item_rng(self._job.seed, index)
         scene, failures = self.lay_out(rng)
         verdict = self._judge.judge(scene, rng)
-        solvable = None
+        solvability = None
         if verdict.stable:
             result = self._search.solve(
                 scene.with_poses(verdict.settled), self._job.seed, SEARCH_BUDGET, optimal=False
             )
-            solvable = result.solvability
-        return GeneratedScene(scene, verdict, failures, solvable)
+            solvability = result.solvability
+        return GeneratedScene(scene, verdict, failures, solvability)
 
     def lay_out(self, rng: np.random.Generator) -> tuple[Scene, Counter[str]]:
         """Derive graphs until one can be laid out.

@@ -100,7 +100,7 @@ class LearnedGenerator:
 
         Args:
             path: File of the checkpoint.
-            config: The simulated world.
+            config: Configuration of the simulated world.
             temperature: Temperature of the softmax; None selects that of the checkpoint.
 
         Raises:

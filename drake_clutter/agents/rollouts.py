@@ -1,4 +1,4 @@
-"""Rollouts of exploration policies in several environments at a time, and their metrics."""
+"""Batched rollouts of exploration policies, and their metrics."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -31,7 +31,8 @@ class PolicyFn(Protocol):
             observations: Their current observations.
 
         Returns:
-            Actions (B, 2), and for each action an object that is stored with it in the rollout.
+            Actions (picked node and place), shape (B, 2), and for each action an object that the
+            rollout stores with it.
         """
 
 
@@ -41,9 +42,9 @@ class Rollout:
 
     Attributes:
         observations: Observation before each action.
-        actions: Picked node and place of each move. Shape (2,) each.
+        actions: Picked node and place of each move (indices of nodes). Shape (2,) each.
         rewards: Reward of each action.
-        policy_extras: What the `PolicyFn` returned along with each action.
+        policy_extras: Objects that the `PolicyFn` returned with the actions.
         termination: Why the episode ended.
         num_hidden: Number of objects that were hidden at the start.
         num_found: Number of those objects that were detected.
@@ -60,7 +61,7 @@ class Rollout:
 
 def collect_rollouts(
     environment: ClutterExploration,
-    count: int,
+    num_episodes: int,
     seed: Sequence[int],
     policy_fn: PolicyFn,
     num_envs: int = 32,
@@ -69,13 +70,13 @@ def collect_rollouts(
 
     Args:
         environment: Template of the environments. Its copies share the cache of its judge.
-        count: Number of episodes.
-        seed: Seed path, below which every episode has a seed of its own.
+        num_episodes: Number of episodes.
+        seed: Integers from which, with its index, each episode is seeded; see `item_rng`.
         policy_fn: Selects the actions.
         num_envs: Maximum number of environments that are stepped together.
     """
-    rollouts = [Rollout() for _ in range(count)]
-    indices = iter(range(count))
+    rollouts = [Rollout() for _ in range(num_episodes)]
+    indices = iter(range(num_episodes))
     running: dict[int, tuple[ClutterExploration, ExplorationObservation]] = {}
     while True:
         while len(running) < num_envs and (index := next(indices, None)) is not None:

@@ -319,7 +319,7 @@ class FeasibilityWorker:
             self._studies[setup] = FeasibilityStudy(setup, config, planner, self._job.seed)
         study = self._studies[setup]
         move_rows = study.plan_all_moves(path.stem, scene_index, scene)
-        pose_error_rows = study.test_pose_errors(path.stem, scene_index, scene, move_rows)
+        pose_error_rows = study.evaluate_pose_errors(path.stem, scene_index, scene, move_rows)
         return {
             "scene": path.stem,
             "unstable": False,

@@ -108,7 +108,7 @@ def generate_scenes(
     for index, result in enumerate(progress(generated, num_done, count), start=num_done):
         layout_failures.update(result.layout_failures)
         save_scene(paths[index], result.scene, job.config.cell, result.verdict)
-        solvable.append(result.solvable.value if result.solvable else None)
+        solvable.append(result.solvability.value if result.solvability else None)
         write_json(
             out / PROGRESS_FILE,
             {

@@ -16,7 +16,7 @@ class ArmReachabilityBound:
         """Create the bound.
 
         Args:
-            config: The simulated world.
+            config: Configuration of the simulated world.
         """
         self._config = config
         self._judge = StaticStabilityJudge(config)

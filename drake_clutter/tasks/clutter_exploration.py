@@ -70,11 +70,12 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
 
         Args:
             scenes: A scene dataset or its file; None selects `DEFAULT_SCENES`.
-            privileged: Whether observations show all objects as they are, instead of K_t.
+            privileged: Whether observations show all objects at their true poses, instead of K_t.
             fidelity: One of `TELEPORT_FIDELITIES`, or a factory of other backends.
             max_moves: Maximum number of moves of an episode; None selects that of the config.
             max_objects: Maximum number of objects of a scene.
-            config: The simulated world; None selects the default with the dataset's work cell.
+            config: Configuration of the simulated world; None selects the default with the
+                dataset's work cell.
         """
         if not isinstance(scenes, SceneDataset):
             path = resource_path(DEFAULT_SCENES) if scenes is None else Path(scenes)

@@ -1,4 +1,4 @@
-"""Exploration episodes: one loop, over backends that carry out a policy's moves."""
+"""Exploration episodes, and backends that execute the moves of a policy."""
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -41,7 +41,7 @@ from drake_clutter.tasks.exploration_task import (
 
 
 class Backend(Protocol):
-    """A scene in which a policy's moves are carried out."""
+    """A scene, its observation, and the execution of moves in it."""
 
     @property
     def config(self) -> ExplorationConfig:
@@ -49,18 +49,18 @@ class Backend(Protocol):
 
     @property
     def scene(self) -> Scene:
-        """The true scene, now."""
+        """The current scene with true poses."""
 
     @property
     def perception(self) -> PerceptionResult:
-        """Result of a perfect detector, now."""
+        """Result of a perfect detector for the current scene."""
 
     @property
     def belief(self) -> Belief:
-        """The policy's belief, now."""
+        """The current belief of the policy."""
 
     def rollout(self, policy: Policy) -> Iterator[MoveAttempt]:
-        """Yield each move that the policy attempts, after the scene was observed again.
+        """Execute the moves of a policy. Yield each attempt after the next observation.
 
         The iterator ends when the policy has no move.
 
@@ -87,18 +87,18 @@ def run_episode(
         stop_when_all_found: Whether the episode ends when every object has been detected.
     """
     task = ExplorationTask(backend.scene, backend.perception, backend.config, max_moves)
-    continuing = (None,) if stop_when_all_found else (None, TerminationReason.ALL_FOUND)
+    nonterminal = (None,) if stop_when_all_found else (None, TerminationReason.ALL_FOUND)
     attempts = backend.rollout(policy)
-    while task.termination in continuing and (attempt := next(attempts, None)) is not None:
+    while task.termination in nonterminal and (attempt := next(attempts, None)) is not None:
         on_transition(task.record(attempt))
     return task
 
 
-class Detector(Protocol):
-    """A perfect detector."""
+class PerfectDetector(Protocol):
+    """Detector that returns the ground truth of the objects in view."""
 
     def perceive(self, scene: Scene) -> PerceptionResult:
-        """Return an observation of a scene."""
+        """Return class, pose and mask of each object in view."""
 
 
 class SteppedBackend:
@@ -108,16 +108,16 @@ class SteppedBackend:
 
     Attributes:
         config: Configuration of the task.
-        scene: The true scene, now.
-        perception: Result of the perfect detector, now.
-        belief: The policy's belief, now.
-        observation: Latest observation, with the names of the belief.
+        scene: The current scene with true poses.
+        perception: Result of the perfect detector for the current scene.
+        belief: The current belief of the policy.
+        observation: Latest observation; its detections have the object names of the belief.
     """
 
     def __init__(
         self,
         executor: MoveExecutor,
-        detector: Detector,
+        detector: PerfectDetector,
         config: ExplorationConfig,
         scene: Scene,
         rng: np.random.Generator,
@@ -125,7 +125,7 @@ class SteppedBackend:
         tracker: Tracker | None = None,
         action_filter: ActionFilter | None = None,
     ) -> None:
-        """Start an episode, and observe the scene.
+        """Start an episode with the first observation of the scene.
 
         Args:
             executor: Executes the commands.
@@ -133,8 +133,9 @@ class SteppedBackend:
             config: Configuration of the task.
             scene: The scene, at rest.
             rng: Random generator of the policy, the placements and the outcomes.
-            tracker: Associates detections with known objects; None if their names persist.
-            action_filter: Adds infeasible moves to the invalid ones; None adds none.
+            tracker: Associates detections with known objects; None if detections have the names of
+                the true objects.
+            action_filter: Adds infeasible moves to the invalid moves; None for no filter.
         """
         self._tracker = tracker
         self._action_filter = action_filter
@@ -175,7 +176,7 @@ class SteppedBackend:
         return outcome
 
     def observable_result(self, outcome: Outcome) -> MoveResult:
-        """Return what the policy can observe of an outcome."""
+        """Return the result of a move as the policy observes it."""
         return outcome.result
 
     def to_ground_truth(self, decision: Decision) -> Decision:
@@ -216,7 +217,7 @@ class SteppedBackend:
             )
             if decision.move is None:
                 return
-            # Translated before the move, after which the names of the belief may change.
+            # Before the move: the next observation may change the names of the belief.
             true_decision = self.to_ground_truth(decision)
             outcome = self.step(decision.move)
             self.update_belief()
@@ -239,7 +240,7 @@ TELEPORT_FIDELITIES = ("static", "static_or_drake", "settle")
 """Models of the outcome of a move in which objects are teleported.
 
 - `static`: The static stability judge decides. A move with an inconclusive verdict is not carried
-  out. Used for training, where simulating one move in a hundred would double the time.
+  out. Used for training, because it needs no simulation.
 - `static_or_drake`: Drake decides where the static stability judge is inconclusive.
 - `settle`: Drake simulates every move.
 """
@@ -263,15 +264,15 @@ def make_teleport_backend_factory(
 
     Args:
         fidelity: One of `TELEPORT_FIDELITIES`.
-        config: The simulated world.
-        simulate_collapse: Whether Drake simulates a collapse to its end, for pictures of the scene.
-            The result of a move is the same.
+        config: Configuration of the simulated world.
+        simulate_collapse: Whether Drake simulates a collapse to its end, for images of the scene.
+            The result of a move does not depend on it.
 
     Raises:
         InputError: The fidelity is unknown.
     """
     executor: MoveExecutor
-    detector: Detector = RayDetector(config.cell.camera)
+    detector: PerfectDetector = RayDetector(config.cell.camera)
     match current_fidelity(fidelity):
         case "static":
             executor = StaticExecutor(config)

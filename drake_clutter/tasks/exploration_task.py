@@ -15,7 +15,13 @@ from drake_clutter.tasks.belief import Decision
 
 
 class TerminationReason(Enum):
-    """Why an episode ended."""
+    """Why an episode ended.
+
+    - `ALL_FOUND`: Every object has been in view.
+    - `COLLAPSED`: The latest move made the scene collapse.
+    - `OUT_OF_MOVES`: The maximum number of moves was reached.
+    - `GAVE_UP`: The policy has no further move.
+    """
 
     ALL_FOUND = "all found"
     COLLAPSED = "collapsed"
@@ -28,7 +34,8 @@ class MoveAttempt:
     """An attempted move and its outcome.
 
     Attributes:
-        decision: The policy's decision, with the names of the true objects. It has a move.
+        decision: The policy's decision, with the names of the true objects. Its move is not
+            None.
         outcome: Outcome of the move.
         next_perception: Result of a perfect detector after the move.
     """
@@ -50,7 +57,7 @@ class Transition(MoveAttempt):
 
     Attributes:
         newly_found: Names of the objects that were detected for the first time, in the order of
-            the scene.
+            the scene's objects.
         reward: `detection_reward` per newly found object, plus `collapse_penalty` if the scene
             collapsed.
     """
@@ -105,7 +112,10 @@ class ExplorationTask:
 
     @property
     def termination(self) -> TerminationReason | None:
-        """Why the episode has ended; None while it continues."""
+        """Why the episode has ended; None while it continues.
+
+        `GAVE_UP` is never returned, because the task does not observe the policy.
+        """
         if self.transitions and self.transitions[-1].outcome.result is MoveResult.COLLAPSED:
             return TerminationReason.COLLAPSED
         if len(self.detected) == len(self.scene.objects):
@@ -125,7 +135,7 @@ class ExplorationTask:
                 continue.
         """
         if self.termination is TerminationReason.COLLAPSED:
-            raise ValueError("the scene has collapsed; expected a stable scene")
+            raise ValueError("the scene has collapsed; no further move can be recorded")
         has_collapsed = attempt.outcome.result is MoveResult.COLLAPSED
         self.scene = attempt.outcome.scene
         self.perception = attempt.next_perception

@@ -1,4 +1,4 @@
-"""Kinematic feasibility: which moves an arm can carry out in a work cell, and why not the others.
+"""Feasibility study: moves that an arm can execute in a work cell, and reasons of failures.
 
 Frames: T the support (tray), O an object, G the gripper.
 """
@@ -55,7 +55,7 @@ class MoveRecord:
         setup: Name of the work cell.
         scene: Name of the scene file.
         pick: Name of the picked object.
-        place: Name of the object on which it is placed, or the tray.
+        place: Name of the object on which it is placed, or `tray`.
         object_class: Class of the picked object.
         resting_side: See `resting_side`.
         pick_x: x of the center of the picked object's top in T [m].
@@ -66,14 +66,15 @@ class MoveRecord:
         place_y: y of p_TO where the object is released [m]; NaN without a free placement.
         place_z: z of p_TO where the object is released [m]; NaN without a free placement.
         result: `PLANNED`, or the value of a `PlanningFailureReason`.
-        detail: What is in the way or out of reach.
+        detail: See `PlanningFailure.detail`; without a free placement, the place.
         failure_value: Quantity that the failure refers to [m, kg or s]; NaN without one.
         planning_s: Planning time [s].
         motion_s: Duration of the motion from home to home [s].
         num_attempts: Number of candidates (grasps and IK solutions) that were checked.
-        clearance: Smallest distance on the path [m]; infinite if all are above 3 cm.
-        nearest_pair: Names of the two bodies at that distance.
-        manipulability: Smaller manipulability of those at the grasp and at the release [m^3].
+        clearance: Smallest distance between two bodies on the path [m]; infinite if all are above
+            3 cm.
+        nearest_pair: Names of the two bodies at the smallest distance.
+        manipulability: Smaller of the manipulabilities at the grasp and at the release [m^3].
     """
 
     setup: str
@@ -106,18 +107,16 @@ MOVE_RECORD_FIELDS = tuple(field.name for field in fields(MoveRecord))
 
 @dataclass(frozen=True)
 class PoseErrorRecord:
-    """A move that was planned with pose errors and checked with true poses.
-
-    It is a row of `pose_errors.csv`.
+    """A plan for poses with errors, checked with the true poses; a row of `pose_errors.csv`.
 
     Attributes:
         setup: Name of the work cell.
         scene: Name of the scene file.
         pick: Name of the picked object.
-        place: Name of the object on which it is placed, or the tray.
+        place: Name of the object on which it is placed, or `tray`.
         error: Standard deviation of the position error [m]; one of `POSE_ERRORS`.
-        result: `holds` if the plan works with the true poses, otherwise `no plan`, `no seal` or
-            what the arm hits.
+        result: `holds` if the plan is valid with the true poses; otherwise `no plan`, `no seal`,
+            or `hits NAME` with the name of the body in collision.
     """
 
     setup: str
@@ -141,7 +140,7 @@ class FeasibilityStudy:
 
         Args:
             setup: Name of the work cell in the records.
-            config: The simulated world with the work cell.
+            config: Configuration of the simulated world with the work cell.
             planner_config: Configuration of the planner.
             seed: Seed of the placements and the pose errors.
         """
@@ -172,7 +171,7 @@ class FeasibilityStudy:
         return item_rng(self._seed, *path)
 
     def planner(self, support: Support) -> PickPlacePlanner:
-        """Return the planner for a support; that of the latest support is cached."""
+        """Return the planner for a support; the planner of the latest support is cached."""
         if self._planner is None or self._planner.cell.support != support:
             cell = self._config.cell.with_support(support)
             self._planner = PickPlacePlanner(cell, self._planner_config)
@@ -234,10 +233,12 @@ class FeasibilityStudy:
             manipulability=float(planner.tool.robot.manipulability(endpoints).min()),
         )
 
-    def test_pose_errors(
+    def evaluate_pose_errors(
         self, name: str, index: int, scene: Scene, records: Sequence[MoveRecord]
     ) -> list[PoseErrorRecord]:
-        """Plan some of the planned moves with pose errors, and check them with the true poses.
+        """Plan moves again with pose errors, and check the plans with the true poses.
+
+        At most `MAX_NOISY_MOVES` of the planned moves are drawn at random.
 
         Args:
             name: Name of the scene in the records.
@@ -296,8 +297,8 @@ class FeasibilityStudy:
                 )
             for q in sample_path(segment.trajectory):
                 for contact in collision_model.distances_below(q, 0.0):
-                    # The gripper is pressed onto the picked object, and that may graze its
-                    # neighbors by as much as their poses are wrong.
+                    # Expected contacts: of the gripper with the picked object, and of that object
+                    # with its neighbors, whose poses have errors.
                     is_expected = plan.pick in contact.pair and contact.pair[0] in contact_bodies
                     if not is_expected or contact.distance < -error - CONTACT_TOLERANCE:
                         return f"hits {contact.pair[1]}"
@@ -343,10 +344,13 @@ def resting_side(o: SceneObject) -> str:
 
 
 def objects_below(picked: SceneObject, objects: Sequence[SceneObject]) -> list[str]:
-    """Return the names of the objects below one whose bounding boxes overlap it, seen from above.
+    """Return the names of the objects below a picked object.
+
+    The bounding box of such an object overlaps that of the picked object in x and y, and ends at
+    most `BELOW_TOLERANCE` above its lower face.
 
     Args:
-        picked: The object.
+        picked: The picked object.
         objects: All objects of the scene.
     """
     lower, upper = picked.bounds_T

@@ -131,7 +131,7 @@ class PartialScene:
         Args:
             grammar: The scene grammar.
             task: Requirements and rewards.
-            config: The simulated world.
+            config: Configuration of the simulated world.
             judge: Judges finished stacks and the finished scene.
         """
         vocabulary = GraphVocabulary.from_grammar(grammar)
@@ -338,7 +338,7 @@ class ClutterGeneration(gymnasium.Env[GenerationObservation, int]):
         Args:
             classes: Object classes of the grammar; None selects the seven YCB objects.
             task: Requirements and rewards; None selects the defaults.
-            config: The simulated world; None selects the default.
+            config: Configuration of the simulated world; None selects the default.
         """
         self.task = task or GenerationTaskConfig()
         self._config = config or ClutterConfig()

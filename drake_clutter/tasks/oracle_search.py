@@ -111,7 +111,7 @@ class OracleSearch:
         """Create a search.
 
         Args:
-            config: The simulated world.
+            config: Configuration of the simulated world.
             judge: A judge whose cache of verdicts is shared; None creates one.
         """
         self._judge = judge or StaticStabilityJudge(config)
