@@ -1,7 +1,7 @@
 """Compare installations of Drake: verdicts on the same scenes, and times.
 
-Each installation writes its own results file, and beside it a record file of the verdicts, with the
-interpreter of its environment:
+Run `measure` with the Python interpreter of each installation. It writes a results file and, beside
+it, a record file of the verdicts. `compare` prints a table of several installations:
 
     python benchmarks/drake_versions.py measure --out drake_1.51.json
     python benchmarks/drake_versions.py compare drake_1.51.json drake_1.58.json
@@ -43,7 +43,7 @@ NUM_STEPS = 400
 EPISODE_SET = "sg_star_15"
 """Scene set of the timed episodes, whose moves the arm carries out."""
 EPISODE_SCENES = (1, 3, 5)
-"""Scenes of that set."""
+"""Indices of the timed scenes in `EPISODE_SET`."""
 EXPLORER = "largest-clear"
 """Explorer of the timed episodes."""
 MAX_MOVES = 20
@@ -51,13 +51,16 @@ MAX_MOVES = 20
 
 
 def load_scene_at_rest(number: int, config: ClutterConfig) -> Scene:
-    """Return a scene of `EPISODE_SET`."""
+    """Return a scene of `EPISODE_SET` with its settled poses."""
     scenes = load_scene_dataset(SCENES / f"{EPISODE_SET}.json", load_catalog())
     return scenes.settled_scene(number, scenes.grammar, config)
 
 
 def measure_steps(config: ClutterConfig) -> dict[str, float]:
-    """Return the time of a step of the station's plant [ms], with all objects asleep and awake."""
+    """Return the time of a step of the station's plant [ms], with all objects asleep and awake.
+
+    The joints of sleeping objects are locked.
+    """
     scene = load_scene_at_rest(EPISODE_SCENES[0], config)
     simulation = StationSimulation(config.cell, scene)
     milliseconds = dict[str, float]()
@@ -159,7 +162,7 @@ def compare(
         | {"verdicts": read_jsonl(verdicts_path(path))[1:]}
         for path in files
     ]
-    print_table([table_row(one, results[0]) for one in results])
+    print_table([table_row(row, results[0]) for row in results])
 
 
 if __name__ == "__main__":

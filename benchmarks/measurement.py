@@ -1,4 +1,4 @@
-"""Measurement of times, and description of the machine that they were measured on."""
+"""Measurement of wall-clock times, and description of the machine."""
 
 import platform
 import time
@@ -20,7 +20,7 @@ class Stopwatch:
     """
 
     def __init__(self) -> None:
-        """Start without measurements."""
+        """Create a stopwatch without measurements."""
         self.seconds = defaultdict[str, list[float]](list)
 
     def measure(self, name: str, call: Callable[[], Result], num_items: int = 1) -> Result:
@@ -46,8 +46,8 @@ class Stopwatch:
         """Measure all calls of some functions while the context is open.
 
         Args:
-            functions: Class or module, and function that is called from it, by the name of the
-                measurement.
+            functions: Owner (class or module) and function, by the name of the measurement. The
+                attribute of the owner is replaced while the context is open.
         """
         for name, (owner, function) in functions.items():
             setattr(owner, function.__name__, self._wrap(name, function))

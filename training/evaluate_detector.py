@@ -41,17 +41,17 @@ from training.script import SeedOption, progress, run_script
 VISIBILITY_BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.01)
 """Bounds of the visible fractions for which recall is given separately."""
 MIN_IOU = 0.5
-"""Least intersection over union of a detection's mask with the object that it detects."""
+"""Smallest intersection over union of the masks of a detection and of its object."""
 
 
 @dataclass(frozen=True)
 class ObjectDetection:
-    """How an object, of which at least a part is in view, was detected.
+    """Detection result of an object that is at least partly in view.
 
     Attributes:
         visible_fraction: Fraction of its pixels that are in view.
-        is_found: Whether a detection's mask covers it, see `MIN_IOU`.
-        is_recognized: Whether that detection has its class, too.
+        is_found: Whether a detection is matched to it by the masks; see `MIN_IOU`.
+        is_recognized: Whether the class of that detection is correct.
         translation_error: Error of the detected position [m]; NaN if it is not recognized.
         rotation_error: Error of the detected rotation [rad]; NaN if it is not recognized.
     """
@@ -65,19 +65,19 @@ class ObjectDetection:
 
 @dataclass(frozen=True)
 class DetectionMetrics:
-    """How the objects of some images were detected.
+    """Detection results of a set of images.
 
     Attributes:
         objects: The objects of the images that are in view.
-        num_false_positives: Number of detections that detect none of them.
-        seconds: Time that the detector took for each image [s].
+        num_false_positives: Number of detections that are matched to no object.
+        seconds: Computing time of the detector for each image [s].
     """
 
     objects: Sequence[ObjectDetection]
     num_false_positives: int
     seconds: Sequence[float]
 
-    def fields(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return the metrics for a results file."""
         found = [o for o in self.objects if o.is_found]
         recognized = [o for o in self.objects if o.is_recognized]
@@ -109,7 +109,7 @@ class DetectionMetrics:
 
 
 def recall(objects: Sequence[ObjectDetection]) -> dict[str, Any]:
-    """Return the fraction of objects that are recognized, with its 95 % interval."""
+    """Return the fraction of objects that are recognized, with its 95 % confidence interval."""
     count = sum(o.is_recognized for o in objects)
     return {
         "objects": len(objects),
@@ -121,7 +121,7 @@ def recall(objects: Sequence[ObjectDetection]) -> dict[str, Any]:
 def detect_objects(
     image: LabeledImage, detector: LearnedDetector, catalog: Catalog, rng: np.random.Generator
 ) -> DetectionMetrics:
-    """Detect the objects of an image, with the noise of a depth camera, and compare with truth.
+    """Detect the objects of a noisy depth image, and compare them with the ground truth.
 
     Args:
         image: The image with its ground truth.
@@ -162,14 +162,14 @@ def mask_iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
     return int(np.count_nonzero(a & b)) / max(1, int(np.count_nonzero(a | b)))
 
 
-def render_image(camera: CameraRenderer, scene: Scene) -> LabeledImage:
+def render_image(renderer: CameraRenderer, scene: Scene) -> LabeledImage:
     """Return an image of a scene with its ground truth."""
-    images = camera.render(scene)
-    visible_fraction = camera.visible_fractions(scene, images.label)
+    images = renderer.render(scene)
+    visible_fractions = renderer.visible_fractions(scene, images.label)
     num_pixels = np.bincount(images.label.ravel() + 1, minlength=len(scene.objects) + 1)[1:]
     unoccluded_pixels = np.array(
         [
-            round(n / visible_fraction[o.name]) if visible_fraction[o.name] > 0 else 1
+            round(n / visible_fractions[o.name]) if visible_fractions[o.name] > 0 else 1
             for n, o in zip(num_pixels, scene.objects, strict=True)
         ]
     )
@@ -211,7 +211,7 @@ def evaluate_images(
         [o for part in parts for o in part.objects],
         sum(part.num_false_positives for part in parts),
         [s for part in parts for s in part.seconds],
-    ).fields()
+    ).to_dict()
 
 
 def main(
