@@ -361,8 +361,8 @@ def load_catalog(folder: Path | None = None) -> Catalog:
         for set_name, members in catalog_file.object_sets.items():
             unknown = [member for member in members if member not in classes]
             if unknown or not members or len(set(members)) != len(members):
-                allowed_values = f"a list, without repeats, of {', '.join(classes)}"
+                expected = f"a list, without repeats, of {', '.join(classes)}"
                 problem = f"object_sets.{set_name}: {format_value(unknown or list(members))}"
-                raise input_error(str(path), f"{problem}; expected {allowed_values}")
+                raise input_error(str(path), f"{problem}; expected {expected}")
             object_sets[set_name] = members
     return Catalog(classes, object_sets, folders)
