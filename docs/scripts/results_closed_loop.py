@@ -58,8 +58,8 @@ def _episodes() -> str:
     )
     text += (
         "\n### Objects found and times\n\n"
-        "*Recall*, *precision*: of the list of objects that the policy knows by class and place "
-        "when all have been in view. *Moves*: mean over the successes. *Robot time*: simulated "
+        "*Recall*, *precision*: of the belief, matched by class and position, when all "
+        "objects have been in view. *Moves*: mean over the successes. *Robot time*: simulated "
         "motion, median. *Wall time*: per episode, median, on two cores shared with other work.\n\n"
     )
     head = [*_SETUP, "fraction found", "recall", "precision", "moves"]

@@ -197,7 +197,7 @@ def _static_and_drake() -> str:
     text += table([*head, "collapsed", "moves"], compared)
     text += (
         "\n### Further policies\n\n"
-        "Clones before fine-tuning with the static stability model alone. SE\\*, cloning: behavior "
+        "Clones before fine-tuning, static stability model alone. *SE\\*, cloning*: behavior "
         "cloning without DAgger.\n\n"
     )
     return text + table([*head, "collapsed", "moves"], others)
@@ -293,7 +293,11 @@ def _trainings() -> str:
     rows = []
     for row in read_training_results("explorer_trainings.json")["rows"]:
         last = row["history"][-1]
-        cells = [row["agent"].replace("collapse costs 1", "collapse penalty 1")]
+        cells = [
+            row["agent"]
+            .replace("collapse costs 1", "collapse penalty 1")
+            .replace("plain cloning", "without DAgger")
+        ]
         cells += [str(last["step"]), number(row["minutes"], 0)]
         cells += [number(last[key], 3) for key in ("success", "found_share", "collapsed")]
         rows.append([*cells, number(last["moves_of_successes"], 1)])

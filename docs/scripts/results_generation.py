@@ -122,7 +122,7 @@ def _scenes() -> str:
     text += _sheets()
     text += (
         "### Sampling temperature\n\n"
-        "SG\\* with 25 nodes of ycb7, sampled at other temperatures than its own, 0.28.\n\n"
+        "SG\\* with 25 nodes of ycb7, sampled at temperatures other than its default, 0.28.\n\n"
     )
     head = ["temperature", "scenes", "stable", "hidden", "solvable", "laid out", "distinct"]
     head += ["stacks", "balanced", "class entropy", "false stable"]
@@ -200,6 +200,7 @@ def _trainings() -> str:
     for path in [*sorted(TRAINING.glob("sg_star_seed_*.json")), TRAINING / "sg_star_paper.json"]:
         training = read_training_results(path.name)
         name = path.stem.removeprefix("sg_star_").replace("_", " ")
+        name = "paper reward" if name == "paper" else name
         rows.append(_training_row("SG\\*, " + name, training["history"][-1], training["minutes"]))
     for stem, name in (("sg", "SG, 15 nodes"), ("sg_14", "SG-14")):
         checkpoint = ROOT / f"training/checkpoints/{stem}.json"
@@ -233,10 +234,10 @@ def _training_row(name: str, last: Mapping[str, Any], minutes: float) -> list[st
 def _sampled() -> str:
     results = read_training_results("sg_star_seed_0.json")
     text = section(
-        "Temperatures near the shipped one",
+        "Temperatures near the default",
         f"{results['sampled_scenes']} scenes of SG\\*, seed 0, by the static judge; stacks that "
-        "are "
-        "too high or cannot be disassembled count as unstable.",
+        "are too high or cannot be disassembled count as unstable. *Rarest class*: fraction of the "
+        "objects that are of the rarest class.",
         seed=results["sampled_seed"],
         results=["training/results/sg_star_seed_0.json"],
     )
@@ -260,7 +261,7 @@ def _disassembly() -> str:
     rows = read_benchmark_results("come_apart.json")["rows"]
     text = section(
         "Disassembly and solvability",
-        "Stable scenes (Drake), split by whether every stack can be taken away from the top, "
+        "Stable scenes (Drake), split by whether every stack can be disassembled from the top, "
         "object by object, while the rest stays stable; *solvable* by the oracle search.",
         command="python benchmarks/disassembly_vs_solvability.py runs/table1/* --out FILE",
         seed=rows[0]["seed"],
@@ -290,7 +291,7 @@ def _speed() -> str:
     text = section(
         "Speed of training",
         f"{results['steps']} environment steps after the replay buffer is warm; one update of 128 "
-        "steps for every four environment steps. The losses run side by side with two threads.",
+        "steps for every four environment steps. With two threads, losses run in parallel.",
         command="python benchmarks/generator_training_speed.py --out FILE",
         results=["benchmarks/results/generator_training.json"],
     )
