@@ -54,7 +54,7 @@ class Case:
     """One episode or generated scene.
 
     Attributes:
-        scenes: Name of the scene set; of a generated scene, name of its generator.
+        scenes: Name of the scene dataset; of a generated scene, name of its generator.
         number: Number of the scene, and seed of every random choice.
         agent: Name of the explorer; "" for a generated scene.
     """
@@ -230,7 +230,7 @@ def _trace(
 
     Args:
         task: The episode.
-        known: Objects that the agent knows at the end, of a backend with a belief of its own.
+        known: Objects in the belief at the end, for a backend with its own belief.
         end: Recorded reason of the end if the agent ended the episode.
     """
     ended = task.termination.value if task.termination else end

@@ -47,9 +47,9 @@ RECORDS = ROOT / "benchmarks/results/behavior_hashes"
 EXPLORERS = ("student", "largest-clear")
 """Explorers of the episodes, which take turns."""
 LARGE_SETS = ("sg_star_25", "rg_25")
-"""Scene sets of the cheap backends, which take turns."""
+"""Scene datasets of the cheap backends, which take turns."""
 MIXED_SETS = ("sg_star_15", "sg_star_25")
-"""Scene sets of the costly backends, which take turns."""
+"""Scene datasets of the costly backends, which take turns."""
 GENERATORS = ("random", "sg-star")
 """Scene generators, which take turns."""
 EPISODES_PER_PROCESS = 10

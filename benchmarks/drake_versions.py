@@ -41,7 +41,7 @@ NODES = 25
 NUM_STEPS = 400
 """Number of steps of the station's plant that are timed."""
 EPISODE_SET = "sg_star_15"
-"""Scene set of the timed episodes, whose moves the arm carries out."""
+"""Scene dataset of the timed episodes, whose moves the arm carries out."""
 EPISODE_SCENES = (1, 3, 5)
 """Indices of the timed scenes in `EPISODE_SET`."""
 EXPLORER = "largest-clear"

@@ -110,7 +110,7 @@ TARGETS = {
 
 Answer = TypeVar("Answer")
 Verdict = tuple[bool | None, tuple[str, ...] | None]
-"""Whether a scene is stable, and its hidden objects; None where the judge does not say."""
+"""Whether a scene is stable, and its hidden objects; None if the judge is inconclusive."""
 AnyJudge = StaticStabilityJudge | DrakeJudge
 
 

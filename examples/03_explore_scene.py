@@ -37,7 +37,7 @@ if __name__ == "__main__":
     parser.add_argument(
         "--fidelity", default="settle", help="static, static_or_drake, settle or arm"
     )
-    parser.add_argument("--scene", type=int, default=0, help="index in the scene set")
+    parser.add_argument("--scene", type=int, default=0, help="index in the scene dataset")
     parser.add_argument("--max-moves", type=int, default=10)
     arguments = parser.parse_args()
     main(arguments.agent, arguments.fidelity, arguments.scene, arguments.max_moves)

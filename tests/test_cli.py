@@ -205,7 +205,7 @@ def test_evaluate_does_not_depend_on_the_number_of_workers(tmp_path: Path) -> No
     assert largest_first["hidden"] == largest_first["within_2"]["found"] == 1.0
 
 
-def test_evaluate_accepts_names_of_shipped_scene_sets() -> None:
+def test_evaluate_accepts_names_of_shipped_scene_datasets() -> None:
     shown = run(
         "evaluate",
         "--scenes",

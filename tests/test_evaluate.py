@@ -47,7 +47,7 @@ def test_a_repeated_policy_is_run_once() -> None:
     )
 
 
-def test_an_unknown_scene_set() -> None:
+def test_an_unknown_scene_dataset() -> None:
     with pytest.raises(
         InputError, match=r"--scenes sg_star_9: does not exist; expected .*sg_star_25"
     ):

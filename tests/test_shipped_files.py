@@ -67,7 +67,7 @@ def test_checkpoints_and_their_configs(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", SETS, ids=name_of)
-def test_scene_sets(path: Path) -> None:
+def test_scene_datasets(path: Path) -> None:
     assert load_scene_dataset(path, CATALOG).cell == DEFAULT_CELL
 
 

@@ -75,7 +75,7 @@ class ClosedLoopEvaluation:
     Attributes:
         perception: See `Scenario`.
         motion: "settle" (teleported, then settled in Drake) or "arm".
-        scenes: Name of the scene set.
+        scenes: Name of the scene dataset.
         agent: See `Scenario`.
         first: Number of the first scene; earlier scenes were used in development.
         count: Number of scenes.

@@ -1,4 +1,4 @@
-r"""Evaluate a trained detector on shipped scene sets and on rendered images.
+r"""Evaluate a trained detector on shipped scene datasets and on rendered images.
 
     python training/evaluate_detector.py --scenes training/scenes/sg_star_25.json \
         --detector training/checkpoints/detector_depth.safetensors --out detector.json
@@ -220,9 +220,11 @@ def main(
     ],
     out: Annotated[Path, typer.Option(metavar="FILE", help="Results file to write (JSON).")],
     scenes: Annotated[
-        list[Path], typer.Option(metavar="FILE", help="Scene set with poses. May be repeated.")
+        list[Path], typer.Option(metavar="FILE", help="Scene dataset with poses. May be repeated.")
     ],
-    count: Annotated[int, typer.Option(min=1, help="Only the first N scenes of each set.")] = 100,
+    count: Annotated[
+        int, typer.Option(min=1, help="Only the first N scenes of each dataset.")
+    ] = 100,
     images: Annotated[
         Path | None,
         typer.Option(
@@ -241,17 +243,17 @@ def main(
     camera = CameraRenderer(config.cell.camera)
     rows = dict[str, Any]()
     for path in scenes:
-        scene_set = load_scene_dataset(path, catalog)
-        numbers = range(min(count, len(scene_set.scenes)))
+        dataset = load_scene_dataset(path, catalog)
+        numbers = range(min(count, len(dataset.scenes)))
         rendered = [
-            render_image(camera, scene_set.settled_scene(k, scene_set.grammar, config))
+            render_image(camera, dataset.settled_scene(k, dataset.grammar, config))
             for k in progress(numbers, path.stem)
         ]
-        class_names = [c.name for c in scene_set.classes]
+        class_names = [c.name for c in dataset.classes]
         rows[path.stem] = evaluate_images(network, class_names, rendered, catalog, seed)
     if images is not None:
-        dataset = ImageDataset(images)
-        held_out = [dataset[k] for k in range(min(count, len(dataset)))]
+        image_dataset = ImageDataset(images)
+        held_out = [image_dataset[k] for k in range(min(count, len(image_dataset)))]
         rows["images"] = evaluate_images(network, network.classes, held_out, catalog, seed)
     write_json(
         out,

@@ -1,4 +1,4 @@
-"""Evaluate explorers on the shipped scene sets, with moves settled in Drake (Tables II and III).
+"""Evaluate explorers on the shipped scene datasets, with moves settled in Drake.
 
     python training/evaluate_explorers.py --workers 2
 
@@ -71,17 +71,17 @@ YCB7_SETS = (
     "sg_star_40",
     "rg_25",
 )
-"""Scene sets of the object set ycb7."""
+"""Scene datasets of the object set ycb7."""
 PANTRY14_SETS = ("sg_14",)
-"""Scene sets of the object set pantry14."""
+"""Scene datasets of the object set pantry14."""
 TABLES = dict.fromkeys(YCB7_SETS, ("table2", YCB7_EXPLORERS)) | dict.fromkeys(
     PANTRY14_SETS, ("table3", PANTRY14_EXPLORERS)
 )
-"""By scene set: the results file of its rows, and the explorers that are evaluated on it."""
+"""By scene dataset: the results file of its rows, and the explorers that are evaluated on it."""
 
 
 def episodes_path(folder: Path, set_name: str, agent: str) -> Path:
-    """Return the record file of an explorer's episodes on a scene set."""
+    """Return the record file of an explorer's episodes on a scene dataset."""
     if agent.endswith(".safetensors"):
         agent = f"{Path(agent).stem}_{checkpoint_sha256(agent, PRETRAINED_EXPLORERS)[:8]}"
     return folder / f"{set_name}_{agent}.jsonl.gz"
@@ -101,7 +101,7 @@ def collect_episodes(
 
     Args:
         path: The record file.
-        scenes: A scene set in `training/scenes`.
+        scenes: A scene dataset in `training/scenes`.
         agent: See `make_policy_factory`.
         count: Number of episodes, on the first scenes of the set.
         fidelity: Model of the moves.
@@ -170,10 +170,10 @@ def table_rows(row: Row) -> list[dict[str, str]]:
 def evaluate_set(
     scenes: SceneDataset, agents: Sequence[str], folder: Path, count: int, **options: Any
 ) -> list[Row]:
-    """Run the episodes of explorers on a scene set and return their rows of the results.
+    """Run the episodes of explorers on a scene dataset and return their rows of the results.
 
     Args:
-        scenes: The scene set.
+        scenes: The scene dataset.
         agents: The explorers.
         folder: Folder of the record files.
         count: Number of episodes, on the first scenes of the set.

@@ -145,7 +145,7 @@ def drop_duplicates(
 
 
 def main(
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Scene set to write (JSON).")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Scene dataset to write (JSON).")],
     work: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the verdicts.")],
     agent: Annotated[
         str, typer.Option(help="Scene generator, as of `drake-clutter generate`.")
@@ -162,7 +162,7 @@ def main(
     ] = False,
     exclude: Annotated[
         list[Path] | None,
-        typer.Option(metavar="FILE", help="Scene set whose graphs are left out. May be repeated."),
+        typer.Option(metavar="FILE", help="Scene dataset whose graphs are excluded. Repeatable."),
     ] = None,
     workers: WorkersOption = 1,
 ) -> None:

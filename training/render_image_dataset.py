@@ -7,7 +7,7 @@ its own (see `drake_clutter.perception.image_dataset`). It is one of
 
     heap       20 objects of random classes in random rotations, which Drake drops on the tray; the
                images show late moments of the fall, and objects are removed from the top
-    generated  a scene of the random generator, or of a trained generator that knows no other
+    generated  a scene of the random generator, or of a trained generator that has no other
                classes, laid out but not settled; objects are removed from the top, and some of
                them are placed elsewhere on the tray
 
@@ -16,7 +16,7 @@ image: the colors of each instance and of the tray, and the background beyond it
 not move.
 
 An interrupted run is resumed by the same command; a larger count extends the dataset. The scenes
-depend on --seed alone: no scene set for evaluation is read.
+depend on --seed alone: no scene dataset for evaluation is read.
 """
 
 import gc
@@ -103,7 +103,7 @@ class ImageJob:
         return HEAP_IMAGES if self.is_heap(item) else GENERATED_IMAGES
 
     def generators(self) -> list[tuple[str, str]]:
-        """Return the generators that know no classes but the job's, each with its object set."""
+        """Return the generators that have no classes but the job's, each with its object set."""
         catalog = load_catalog()
         classes = set(catalog.object_set(self.objects))
         candidates = [(agent, objects or self.objects) for agent, objects in GENERATORS.items()]

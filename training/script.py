@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "training/results"
 """Published results of the trainings."""
 SCENES = ROOT / "training/scenes"
-"""Shipped scene sets."""
+"""Shipped scene datasets."""
 
 ConfigOption = Annotated[
     Path | None,

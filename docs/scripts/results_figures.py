@@ -27,7 +27,7 @@ from results_files import (
 IMAGES = ROOT / "docs/images"
 SEED_SUFFIX = ", seed "
 """Separates the name of a training from its seed, if that is not 0."""
-SCENE_SETS = {
+DATASETS = {
     "paper_hardness": "as hard as the paper's, 25 nodes",
     "sg_star_25": "SG*, 25 nodes",
     "sg_star_40": "SG*, 40 nodes",
@@ -201,8 +201,8 @@ def draw_objects_found(path: Path) -> None:
     figure, panels = plt.subplots(
         2, 2, figsize=(18, 12), layout="constrained", sharex=True, sharey=True
     )
-    for panel, name in zip(panels.flat, SCENE_SETS, strict=True):
-        _draw_scene_set(panel, name)
+    for panel, name in zip(panels.flat, DATASETS, strict=True):
+        _draw_dataset(panel, name)
     handles = {
         label: line
         for panel in panels.flat
@@ -213,7 +213,7 @@ def draw_objects_found(path: Path) -> None:
     plt.close(figure)
 
 
-def _draw_scene_set(panel: Axes, name: str) -> None:
+def _draw_dataset(panel: Axes, name: str) -> None:
     """Draw one panel, on the scenes that all policies have explored."""
     runs: dict[str, list[dict[str, Any]]] = {}
     for policy in POLICIES:
@@ -231,7 +231,7 @@ def _draw_scene_set(panel: Axes, name: str) -> None:
         style = "--" if policy == "full-knowledge" else "-"
         panel.plot(found / hidden, label=label, color=color, linestyle=style)
     panel.set(
-        title=f"{SCENE_SETS[name]}; {count} scenes",
+        title=f"{DATASETS[name]}; {count} scenes",
         xlim=(0, MAX_MOVES),
         ylim=(0, 1.02),
         xticks=range(0, MAX_MOVES + 1, 5),

@@ -34,8 +34,8 @@ def evaluate(
     scenes: Annotated[
         str | None,
         typer.Option(
-            help="Shipped scene set, such as sg_star_25; a scene set file; or a folder of scene "
-            "files with verdicts, such as the `scenes` folder that `generate` writes."
+            help="Shipped scene dataset, such as sg_star_25; scene dataset file; or folder of "
+            "scene files with verdicts, such as the `scenes` folder that `generate` writes."
         ),
     ] = None,
     agents: Annotated[
@@ -79,7 +79,10 @@ def evaluate(
 
     scenes_source = scenes or source
     if scenes_source is None or None not in (scenes, source):
-        allowed = "a shipped scene set, a scene set file, or a folder of scene files with verdicts"
+        allowed = (
+            "a shipped scene dataset, a scene dataset file, "
+            "or a folder of scene files with verdicts"
+        )
         raise InputError(f"--scenes: expected once, with {allowed}")
     reject_support_settings(settings)
     evaluation_scenes = load_evaluation_scenes(scenes_source, catalog)[:max_scenes]

@@ -37,7 +37,7 @@ class EvaluationScene:
     """Stable scene with hidden objects.
 
     Attributes:
-        file: Scene file or scene set.
+        file: Scene file or scene dataset.
         index: Index of the scene in its set; None for a scene file.
         classes: Names of the classes that its objects may have.
         cell: Work cell that the scene was made with.
@@ -50,10 +50,10 @@ class EvaluationScene:
 
 
 def load_evaluation_scenes(source: str, catalog_folder: Path | None) -> list[EvaluationScene]:
-    """Return the stable scenes with hidden objects of a folder or a scene set.
+    """Return the stable scenes with hidden objects of a folder or a scene dataset.
 
     Args:
-        source: Folder of scene files, scene set file, or name of a shipped scene set.
+        source: Folder of scene files, scene dataset file, or name of a shipped scene dataset.
         catalog_folder: Asset folder with the user's object classes, or None.
 
     Raises:
@@ -72,17 +72,17 @@ def load_evaluation_scenes(source: str, catalog_folder: Path | None) -> list[Eva
             raise InputError(f"--scenes {source}: does not exist; expected {allowed}")
         scenes = sets[source]
     if scenes.is_file():
-        scene_set = load_scene_dataset(scenes, catalog)
-        classes = frozenset(c.name for c in scene_set.classes)
+        dataset = load_scene_dataset(scenes, catalog)
+        classes = frozenset(c.name for c in dataset.classes)
         return [
-            EvaluationScene(scenes, number, classes, scene_set.cell)
-            for number in range(len(scene_set.scenes))
+            EvaluationScene(scenes, number, classes, dataset.cell)
+            for number in range(len(dataset.scenes))
         ]
     paths = sorted(scenes.glob("*.yaml"))
     if not paths:
         raise InputError(
             f"{scenes}: holds no scene files (*.yaml); give the `scenes` folder that `generate` "
-            "wrote, or a scene set"
+            "wrote, or a scene dataset"
         )
     evaluation_scenes = []
     for path in paths:
