@@ -128,7 +128,7 @@ def test_larger_pose_errors_invalidate_more_plans() -> None:
         for error in (0.002, 0.040)
     ]
     assert holds[0] > holds[1]
-    assert {row.result for row in found} - {"holds", "no plan"}, "some fail, and it is said how"
+    assert {row.result for row in found} - {"holds", "no plan"}, "some plans fail with a reason"
 
 
 def test_the_reachability_map_agrees_with_single_poses() -> None:

@@ -105,7 +105,7 @@ def test_the_installed_package_works_from_anywhere(installed: Path, tmp_path: Pa
 def test_the_installed_package_renders_and_finds_its_assets(
     installed: Path, tmp_path: Path
 ) -> None:
-    """Without the extras: PyTorch is the one thing that the doctor misses."""
+    """Without the extras, `doctor` reports only PyTorch as missing."""
     command = installed / "bin" / "drake-clutter"
     result = subprocess.run(
         [command, "doctor", "--json"],
@@ -121,6 +121,6 @@ def test_the_installed_package_renders_and_finds_its_assets(
 
 
 def test_the_editable_package_works_from_anywhere(tmp_path: Path) -> None:
-    """The environment that `make test` makes."""
+    """The environment that `make test` creates."""
     for line in run(sys.executable, "-c", PRINT_PATHS, cwd=tmp_path).splitlines():
         assert Path(line).is_relative_to(ROOT)

@@ -125,7 +125,7 @@ def test_a_warm_start_with_more_objects_keeps_the_learned_values(checkpoint: Pat
 def test_shipped_agents_hide_objects_in_stable_stacks(
     name: str, objects: str, hidden: float, static_judge: StaticStabilityJudge
 ) -> None:
-    """As the static judge sees it; docs/results has what Drake says of many more."""
+    """Stability and hidden objects are those of the static judge."""
     agent, grammar, generator = (
         make_generation_agent(name, ClutterConfig()),
         GRAMMARS[objects],

@@ -136,7 +136,7 @@ def local_results(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[int, b
 def test_results_and_order_are_those_of_one_local_worker(
     cluster: Cluster, tmp_path: Path, local_results: list[tuple[int, bytes]]
 ) -> None:
-    """One of the three finds no room, and holds nothing up."""
+    """One of the three workers finds no free CPU, which delays nothing."""
     there = list(
         map_ordered(
             partial(RandomNumbers, tmp_path),
@@ -163,7 +163,7 @@ def test_items_of_killed_workers_are_repeated_a_limited_number_of_times(
 def test_items_of_a_lost_node_are_repeated(
     cluster: Cluster, tmp_path: Path, local_results: list[tuple[int, bytes]]
 ) -> None:
-    """By the worker on the other node, where there is no room for the lost one."""
+    """The other node's worker computes them; no CPU is free to replace the lost worker."""
     node = next(iter(cluster.worker_nodes))
 
     def lose() -> None:
@@ -215,7 +215,7 @@ def test_generate_writes_the_same_scenes_when_a_worker_is_killed(
         output, errors = process.communicate(timeout=120)
     assert process.returncode == 0, errors
     assert read_scene_files(tmp_path / "there") == read_scene_files(tmp_path / "local")
-    assert json.loads(output)["count"] == 3  # what Ray says of the killed worker is not among it
+    assert json.loads(output)["count"] == 3  # without the messages of Ray on the killed worker
 
 
 def test_exceptions_are_raised_unchanged_in_the_order_of_items(cluster: Cluster) -> None:
@@ -232,7 +232,7 @@ def test_exceptions_are_raised_unchanged_in_the_order_of_items(cluster: Cluster)
 def test_workers_have_the_folder_and_environment_of_local_ones(
     cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Processes of their own, which start in this folder and are told to use one thread."""
+    """Commands run in processes of their own, in this folder, with one thread."""
     monkeypatch.chdir(tmp_path)
     Path("here.txt").write_text("found")
     seen = list(

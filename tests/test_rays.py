@@ -22,8 +22,8 @@ from drake_clutter.stability.shape_table import ShapeTable
 
 CAMERA = DEFAULT_CELL.camera
 RAYS = RayCaster(CAMERA)
-# Detects whatever it meets, so that its masks are a label image.
-OPEN_MINDED = RayCaster(CAMERA.model_copy(update={"visibility_threshold": 1e-9}))
+# Without a visibility threshold, so that the masks form a label image.
+RAYS_WITHOUT_THRESHOLD = RayCaster(CAMERA.model_copy(update={"visibility_threshold": 1e-9}))
 ALL_SHAPES = (
     "cracker_box",
     "sugar_box",
@@ -34,7 +34,7 @@ ALL_SHAPES = (
 )
 
 
-def labels(scene: Scene, caster: RayCaster = OPEN_MINDED) -> NDArray[np.int64]:
+def labels(scene: Scene, caster: RayCaster = RAYS_WITHOUT_THRESHOLD) -> NDArray[np.int64]:
     """Return the index of the object that each ray meets first, or -1."""
     found = np.full((caster.camera.height, caster.camera.width), -1)
     for detection in caster.observe(scene)[0].detections:
@@ -172,7 +172,7 @@ def test_another_camera(config: Camera) -> None:
 def test_a_box_from_straight_above_covers_its_top(
     name: str, length: float, width: float, height: float, orientation: Orientation
 ) -> None:
-    """The visible top is as large as the pinhole model says.
+    """The visible top has the size of the pinhole model.
 
     Pixels at its outline may count or not: less than half its length in pixels.
     """

@@ -187,7 +187,7 @@ def leaning(o: SceneObject) -> SceneObject:
 
 
 LEANS = scene_of(*STACKS.objects, leaning(resting("gelatin_box", xy=(0.2, -0.2), name="leaning")))
-# As settling may leave it: its center 1 mm inside the edge, where the judge wants 2 mm.
+# As settling may leave it: its center 1 mm inside the edge, but the judge requires 2 mm.
 JUST_RESTS = scene_of(
     *(
         resting("cracker_box", name="below"),

@@ -184,7 +184,7 @@ def test_a_box_on_feet_stands_while_its_center_is_between_them(
     assert (found is None) == expected
 
 
-# --- What must not matter ---
+# --- Invariance ---
 
 ANYTHING = st.lists(
     st.tuples(
@@ -230,7 +230,7 @@ def test_quarter_turns_are_no_matter(layers: Layers, quarters: int) -> None:
 @given(ANYTHING, st.randoms(use_true_random=False))
 @settings(max_examples=60)
 def test_the_order_of_the_objects_is_no_matter(layers: Layers, shuffle: Random) -> None:
-    """The order of the objects does not matter, unless two objects are inconclusive."""
+    """The verdict is independent of the order of objects, unless two are inconclusive."""
     scene = scene_of(*column(layers), side=2.0)
     supports = STATIC_JUDGE.find_supports(scene)
     assume(not isinstance(supports, InconclusiveVerdict))
