@@ -107,7 +107,7 @@ NUM_MOVES = 1000
 
 @dataclass(frozen=True)
 class WorkerPool:
-    """Where the computation runs.
+    """Options of the parallel computation.
 
     Attributes:
         workers: Number of processes.
@@ -177,7 +177,7 @@ def collect_verdicts(batch: SceneBatch, count: int, folder: Path, pool: WorkerPo
         batch: The batch.
         count: Number of scenes.
         folder: Folder of the record file.
-        pool: Where the computation runs.
+        pool: Options of the parallel computation.
     """
     return collect_records(
         folder / f"{batch.name}.jsonl.gz",
@@ -280,7 +280,7 @@ def collect_moves(
         num_scenes: Number of scenes; the moves are spread over those that are stable.
         count: Number of moves.
         folder: Folder of the record files.
-        pool: Where the computation runs.
+        pool: Options of the parallel computation.
     """
     records = collect_verdicts(batch, num_scenes, folder, pool)
     stable = [record for record in records if "settled" in record]
@@ -300,7 +300,7 @@ def collect_moves(
 
 
 def at_rest(scene: Scene, record: Record) -> Scene:
-    """Return a stable scene as it came to rest.
+    """Return a stable scene with its settled poses.
 
     Args:
         scene: The scene as laid out.

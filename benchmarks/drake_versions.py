@@ -156,7 +156,7 @@ def compare(
         ),
     ],
 ) -> None:
-    """Print how far verdicts agree with those of the first file, and the times."""
+    """Print the agreement of the verdicts with those of the first file, and the times."""
     results = [
         json.loads(path.read_text(encoding="utf-8"))
         | {"verdicts": read_jsonl(verdicts_path(path))[1:]}

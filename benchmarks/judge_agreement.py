@@ -1,4 +1,4 @@
-"""Measure how far the static stability model agrees with Drake, and Drake with itself.
+"""Measure the agreement of the static stability model with Drake, and of Drake with itself.
 
     python benchmarks/collect_drake_verdicts.py FOLDER --workers 2
     python benchmarks/judge_agreement.py FOLDER --out judges.json --figure disagreements.png

@@ -116,7 +116,7 @@ AnyJudge = StaticStabilityJudge | DrakeJudge
 
 @dataclass(frozen=True)
 class SceneSize:
-    """Scenes with a certain number of objects.
+    """Scenes with a given number of objects.
 
     Attributes:
         objects: Number of objects.
@@ -161,7 +161,7 @@ class Case:
 
 
 def make_generator(nodes: int, tray_side: float, seed: int) -> SceneGenerator:
-    """Return the random generator on a tray of a certain side [m]."""
+    """Return the random generator on a tray of a given side length [m]."""
     support = CONFIG.cell.support.model_copy(update={"size": (tray_side, tray_side)})
     config = replace(CONFIG, cell=CONFIG.cell.with_support(support))
     return SceneGenerator(GenerationJob("random", "ycb7", None, nodes, seed, config))

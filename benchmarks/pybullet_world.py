@@ -1,4 +1,4 @@
-"""Scenes in PyBullet, which `judge_speed.py` compares Drake with."""
+"""Scenes in PyBullet, for the comparison with Drake in `judge_speed.py`."""
 
 import math
 from pathlib import Path

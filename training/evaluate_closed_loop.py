@@ -128,7 +128,7 @@ class EpisodeRunner:
     """Runs episodes; a worker for `map_ordered`."""
 
     def __init__(self) -> None:
-        """Load what all episodes share."""
+        """Load the data that all episodes share."""
         catalog = load_catalog()
         self._load_set = cache(lambda name: load_scene_dataset(SCENES / f"{name}.json", catalog))
         self._make_policy = cache(lambda agent: make_policy(agent, Scenario().world))
@@ -236,7 +236,7 @@ def upgrade_scenario(header: Any) -> Any:
 
 
 def episode_record(task: ExplorationTask, known: Sequence[SceneObject]) -> Row:
-    """Return what is recorded of an episode.
+    """Return the record of an episode.
 
     Args:
         task: The episode.

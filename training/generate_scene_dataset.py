@@ -1,4 +1,4 @@
-r"""Generate a dataset of stable scenes for explorers: one small scene-set file.
+r"""Generate a dataset of stable scenes for explorers: one JSON file.
 
     python training/generate_scene_dataset.py --seed 100 --work runs/train --out train.json
     python training/generate_scene_dataset.py --with-poses --count 300 --seed 9000 \

@@ -77,7 +77,7 @@ _EARLIER_JOB_FIELDS = {"dropped_share": "heap_fraction"}
 
 @dataclass(frozen=True)
 class ImageJob:
-    """What determines the images of an item.
+    """Parameters that determine the images of an item.
 
     Attributes:
         objects: Name of the object set.
@@ -118,7 +118,7 @@ class ItemRenderer:
     """Renders the items of a job; a worker for `map_ordered`."""
 
     def __init__(self, job: ImageJob, out: Path) -> None:
-        """Load what all items share.
+        """Load the data that all items share.
 
         Args:
             job: What is rendered.
@@ -167,7 +167,7 @@ class ItemRenderer:
             )
 
     def _generated_scenes(self, count: int, rng: np.random.Generator) -> Iterator[Scene]:
-        """Yield a generated scene, and what is left as objects are removed or moved."""
+        """Yield a generated scene, and the scene after each removal or move of an object."""
         generators = self._job.generators()
         agent, objects = generators[rng.integers(len(generators))]
         if agent not in self._generators:
@@ -192,7 +192,7 @@ def remove_object(scene: Scene, removed: SceneObject) -> Scene:
 
 
 def sample_top_object(scene: Scene, rng: np.random.Generator) -> SceneObject:
-    """Return a random object of a scene that is below no higher object, seen from above."""
+    """Return a random object of a scene that no higher object covers, seen from above."""
     top_objects = [
         o
         for o in scene.objects

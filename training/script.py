@@ -76,7 +76,7 @@ def progress(
 
 
 def format_number(value: float | None, digits: int = 2) -> str:
-    """Return a number with so many decimals; "" for None."""
+    """Return a number with a fixed number of decimals; "" for None."""
     return "" if value is None else f"{value:.{digits}f}"
 
 

@@ -56,7 +56,7 @@ def section(
 
 
 def number(value: float | None, digits: int = 2) -> str:
-    """Return a number with a fixed count of decimals, "" for None."""
+    """Return a number with a fixed number of decimals; "" for None."""
     return "" if value is None else f"{value:.{digits}f}"
 
 

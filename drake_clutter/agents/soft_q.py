@@ -387,7 +387,7 @@ class SoftQLearner:
         return ended
 
     def _num_updates_due(self) -> int:
-        """Return the number of updates that belong to the steps so far."""
+        """Return the total number of updates that are due after the steps so far."""
         return max(0, self.step - self.config.learning_starts) // self.config.train_frequency
 
     def _update(self) -> float | None:

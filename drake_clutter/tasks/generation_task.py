@@ -67,7 +67,7 @@ class GenerationTaskConfig:
 
 
 class StackFailure(Enum):
-    """Why a finished stack ends the derivation."""
+    """Reason why a finished stack ends the derivation."""
 
     TOO_HIGH = "stack too high"
     UNSTABLE = "unstable"

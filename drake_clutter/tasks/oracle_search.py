@@ -92,7 +92,7 @@ class _State:
 
 
 class _OutOfBudgetError(Exception):
-    """The search has evaluated as many moves as it may."""
+    """The maximum number of evaluated moves was reached."""
 
 
 class OracleSearch:
