@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from drake_clutter.cli.output import out_console
+from drake_clutter.cli.output import print_line
 
 assets_app = typer.Typer(help="Build the models of object classes.", no_args_is_help=True)
 
@@ -27,4 +27,4 @@ def build(
     from drake_clutter.assets import build_assets
 
     for built in build_assets(folder, classes):
-        out_console.print(f"Built {built}.")
+        print_line(f"Built {built}.")

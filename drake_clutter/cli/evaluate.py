@@ -22,7 +22,7 @@ from drake_clutter.cli.options import (
     SetOption,
     WorkersOption,
 )
-from drake_clutter.cli.output import out_console, print_json, progress_bar
+from drake_clutter.cli.output import escape_markup, out_console, print_json, progress_bar
 from drake_clutter.files import InputError
 
 
@@ -117,7 +117,7 @@ def evaluate(
     hidden = f"{rows[0]['hidden']:.1f} hidden objects per scene"
     table = Table(
         *table_rows[0],
-        title=f"{scenes_source}: {rows[0]['episodes']} scenes, {hidden}",
+        title=f"{escape_markup(scenes_source)}: {rows[0]['episodes']} scenes, {hidden}",
         box=SIMPLE,
         padding=(0, 1, 0, 0),
         caption=EVALUATION_CAPTION,

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from drake_clutter.cli.options import CatalogOption, InitialPosesOption, OutOption, SceneArgument
-from drake_clutter.cli.output import out_console
+from drake_clutter.cli.output import print_line
 from drake_clutter.files import prepare_output_directory
 
 
@@ -41,4 +41,4 @@ def export(
     prepare_output_directory(out)
     exported = file.scene if initial_poses else file.settled_scene
     path = export_scene(exported, ExportFormat(format.value), out)
-    out_console.print(f"Wrote {path}.")
+    print_line(f"Wrote {path}.")

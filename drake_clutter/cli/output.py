@@ -37,6 +37,11 @@ def escape_markup(text: str) -> str:
     return text.replace("[", "\\[")
 
 
+def print_line(text: str) -> None:
+    """Print a line on standard output as it is, since it may contain a path."""
+    out_console.print(text, markup=False, soft_wrap=True)
+
+
 def print_json(document: Any) -> None:
     """Print a document as JSON on standard output."""
     print(json.dumps(document, indent=2))
@@ -56,7 +61,7 @@ def print_result(
     if as_json:
         print_json(document)
         return
-    table = Table("", "", title=title, show_header=False)
+    table = Table("", "", title=escape_markup(title), show_header=False)
     for label, text in rows.items():
         table.add_row(escape_markup(label), escape_markup(text))
     out_console.print(table)
@@ -131,9 +136,9 @@ def show_recording(
         except OSError as error:
             problem = f"cannot be written ({error.strerror}); expected a writable path"
             raise InputError(f"--html {html_file}: {problem}") from error
-        out_console.print(f"Wrote {html_file}.")
+        print_line(f"Wrote {html_file}.")
         return
     meshcat = serve_recording(scene, frames, cell)
-    out_console.print(f"Showing {name} at {meshcat.web_url()}; press Ctrl-C to stop.")
+    print_line(f"Showing {name} at {meshcat.web_url()}; press Ctrl-C to stop.")
     while True:
         time.sleep(1)
