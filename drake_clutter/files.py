@@ -5,9 +5,11 @@ import json
 import os
 import reprlib
 import secrets
+import stat
 import sys
+import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +115,25 @@ def prepare_output_directory(path: Path, *, allowed_entries: frozenset[str] = fr
             "give a folder that is new or empty"
         )
     return path
+
+
+def private_temporary_folder(purpose: str) -> Path:
+    """Return a folder for temporary files that later runs of the same user find again.
+
+    Other users cannot write to it. If someone else has created a folder of its name, it is a new
+    folder with a random name.
+
+    Args:
+        purpose: Part of the folder's name.
+    """
+    folder = Path(tempfile.gettempdir()) / f"drake_clutter_{purpose}_{os.getuid()}"
+    with suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+    status = folder.lstat()
+    others_may_write = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not others_may_write:
+        return folder
+    return Path(tempfile.mkdtemp(prefix=f"drake_clutter_{purpose}_"))
 
 
 def file_sha256(path: Path) -> str:

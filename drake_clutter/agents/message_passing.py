@@ -13,10 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg.cython_blas  # noqa: F401, numba's BLAS; loaded before its threads are limited
 import torch
-from numba import njit
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 from torch.nn.functional import leaky_relu
+
+from drake_clutter.compilation import njit
 
 NEGATIVE_SLOPE = 0.01
 """Slope of LeakyReLU for negative inputs; PyTorch's default."""

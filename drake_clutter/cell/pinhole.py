@@ -8,8 +8,9 @@ and all products with it are exact.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from drake_clutter.compilation import njit
 
 Floats = NDArray[np.float64]
 

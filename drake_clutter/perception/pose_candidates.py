@@ -3,10 +3,10 @@
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from drake_clutter.cell.pinhole import Floats, backproject
+from drake_clutter.compilation import njit
 from drake_clutter.perception.pose_score import (
     COARSE_RAYS,
     DEPTH_TOLERANCE,

@@ -9,10 +9,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from drake_clutter.cell.pinhole import Floats, Pinhole, pose_to_camera, project
+from drake_clutter.compilation import njit
 
 DEPTH_TOLERANCE = 0.006
 """Depth difference at which a pixel stops to support a pose [m]; about twice the D435's noise."""

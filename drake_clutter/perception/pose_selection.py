@@ -10,12 +10,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.pinhole import pose_to_camera
+from drake_clutter.compilation import njit
 from drake_clutter.perception.pose_score import (
     camera_position_in_object,
     cast_ray_row,

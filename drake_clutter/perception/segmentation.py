@@ -16,13 +16,13 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor, nn
 
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.support import Support
+from drake_clutter.compilation import njit
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import load_checkpoint
 

@@ -9,8 +9,9 @@ takes an eighth of the time on a grid four times as fine; a test compares the du
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from drake_clutter.compilation import njit
 
 Floats = NDArray[np.float64]
 

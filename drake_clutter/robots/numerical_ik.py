@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from drake_clutter.compilation import njit
 from drake_clutter.robots.inverse_kinematics import MAX_JOINT_JUMP
 from drake_clutter.robots.joint_range import FULL_TURN, JointRange
 from drake_clutter.robots.serial_chain import SerialChain, chain_frames, chain_jacobian

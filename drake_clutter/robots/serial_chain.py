@@ -6,8 +6,9 @@ Frames: B is the robot's base, F is its flange, z out of the arm.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from drake_clutter.compilation import njit
 
 Floats = NDArray[np.float64]
 

@@ -1,12 +1,10 @@
 """Conversion of STL meshes, which Drake does not read, to OBJ."""
 
-import os
-import tempfile
 from pathlib import Path
 
 import trimesh
 
-from drake_clutter.files import InputError, atomic_write, file_sha256
+from drake_clutter.files import InputError, atomic_write, file_sha256, private_temporary_folder
 
 
 def convert_stl_to_obj(path: Path) -> Path:
@@ -20,8 +18,8 @@ def convert_stl_to_obj(path: Path) -> Path:
     Raises:
         InputError: The file is not an STL mesh.
     """
-    folder = Path(tempfile.gettempdir()) / f"drake_clutter_meshes_{os.getuid()}"
-    obj_path = folder / f"{path.stem}_{file_sha256(path)[:16]}.obj"
+    name = f"{path.stem}_{file_sha256(path)[:16]}_normals.obj"
+    obj_path = private_temporary_folder("meshes") / name
     if obj_path.is_file():
         return obj_path
     try:
@@ -31,7 +29,6 @@ def convert_stl_to_obj(path: Path) -> Path:
         is_empty = True
     if is_empty:
         raise InputError(f"{path}: is not an STL mesh; expected OBJ, glTF, VTK or STL")
-    folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(obj_path) as temporary:
-        mesh.export(temporary, file_type="obj")
+        mesh.export(temporary, file_type="obj", include_normals=True)  # which VTK needs
     return obj_path

@@ -7,8 +7,9 @@ degrees about z); 1 to 6 are the Denavit-Hartenberg frames; frame 6 is the flang
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from drake_clutter.compilation import njit
 
 Floats = NDArray[np.float64]
 

@@ -6,7 +6,6 @@ from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import ConvexHull
@@ -15,6 +14,7 @@ from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.pinhole import MIN_DEPTH, point_to_camera, project
 from drake_clutter.cell.support import Support
+from drake_clutter.compilation import njit
 from drake_clutter.config import ExplorationConfig
 from drake_clutter.scenes.interfaces import Detection, Move, Observation, PickPlaceCommand
 from drake_clutter.scenes.scene import TRAY, Pose

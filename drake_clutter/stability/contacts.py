@@ -4,7 +4,8 @@ Frame T is that of the support: its origin is at the center of the floor, and z 
 """
 
 import numpy as np
-from numba import njit
+
+from drake_clutter.compilation import njit
 
 MAX_CONTACT_GAP = 0.002
 """Faces whose heights differ by less than this are in contact [m]."""

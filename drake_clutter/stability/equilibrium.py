@@ -8,8 +8,8 @@ for each object and four columns for each corner, the edges of a friction pyrami
 """
 
 import numpy as np
-from numba import njit
 
+from drake_clutter.compilation import njit
 from drake_clutter.stability.contacts import GROUND, contact_polygon
 from drake_clutter.stability.nnls import nnls
 

@@ -5,7 +5,8 @@ solver cannot be called from compiled functions; the tests compare the two.
 """
 
 import numpy as np
-from numba import njit
+
+from drake_clutter.compilation import njit
 
 
 @njit(cache=True, fastmath={"reassoc"})

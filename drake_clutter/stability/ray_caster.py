@@ -10,11 +10,11 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.pinhole import MIN_DEPTH, point_to_camera, project, vector_to_camera
+from drake_clutter.compilation import njit
 from drake_clutter.scenes.interfaces import Detection, Observation
 from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.stability.shape_table import Floats, Ints, ShapeTable
