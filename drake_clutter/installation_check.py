@@ -46,6 +46,7 @@ def run_checks() -> list[Check]:
         _run_probe(
             probe_rendering, "on Debian: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"
         ),
+        _run_probe(probe_compilation, "set NUMBA_CACHE_DIR to a folder that can be written"),
         _run_probe(probe_solvers, "install Drake's own wheel: pip install --force-reinstall drake"),
         _run_probe(
             probe_torch, "needed by the trained policies: pip install 'drake-clutter[learned]'"
@@ -106,6 +107,19 @@ def probe_rendering() -> str:
     return "VTK over EGL renders"
 
 
+def probe_compilation() -> str:
+    """Return the version of numba and the folder in which it keeps compiled functions."""
+    import numba
+
+    import drake_clutter.stability.static_judge  # noqa: F401, its functions are compiled
+    from drake_clutter.compilation import cache_folder
+
+    folder = cache_folder()
+    if folder is None:
+        raise ProbeError("no folder for compiled functions can be written")
+    return f"numba {numba.__version__} keeps compiled functions in {folder}"
+
+
 def probe_solvers() -> str:
     """Return the solvers that motion planning and static equilibrium use."""
     from pydrake.solvers import ClarabelSolver, IpoptSolver, SnoptSolver
@@ -132,9 +146,14 @@ def probe_torch() -> str:
 
 
 def probe_assets() -> str:
-    """Check that every shipped object class has a model."""
+    """Check that every shipped object class has a model, and render one with its texture."""
+    import numpy as np
+
     from drake_clutter.catalog import load_catalog
+    from drake_clutter.cell.work_cell import default_cell
     from drake_clutter.resources import resource_path
+    from drake_clutter.scenes.scene import Pose, Scene, SceneObject
+    from drake_clutter.simulation.camera_renderer import CameraRenderer
 
     catalog = load_catalog()
     unbuilt = [
@@ -147,6 +166,11 @@ def probe_assets() -> str:
             f"{len(unbuilt)} of {len(catalog.classes)} object classes have no model, the first is "
             f"{unbuilt[0]}"
         )
+    cell = default_cell()
+    entry = next(iter(catalog.classes.values()))
+    scene = Scene((SceneObject(entry.name, entry, Pose((0.0, 0.0, 0.2))),), cell.support)
+    if not np.any(CameraRenderer(cell.camera).render_label(scene) == 0):
+        raise ProbeError(f"{entry.sdf_path} is not visible in a rendered image")
     return f"{len(catalog.classes)} object classes in {resource_path('sdf_assets')}"
 
 

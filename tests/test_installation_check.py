@@ -18,7 +18,8 @@ def torch_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_all_checks_pass() -> None:
     found = {check.name: check for check in installation_check.run_checks()}
-    assert list(found) == ["drake", "rendering", "solvers", "torch", "assets", "machine"]
+    names = ["drake", "rendering", "compilation", "solvers", "torch", "assets", "machine"]
+    assert list(found) == names
     assert [check for check in found.values() if not check.ok] == []
     assert all(check.detail and not check.remedy for check in found.values())
     assert "SNOPT" in found["solvers"].detail

@@ -10,6 +10,7 @@ from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
+from drake_clutter.cell.sdf_text import mesh_uri
 from drake_clutter.files import InputError
 from drake_clutter.resources import resource_path
 from drake_clutter.robots.stl_conversion import convert_stl_to_obj
@@ -81,9 +82,9 @@ def read_model_text(path: Path, *, visuals: bool) -> str:
     packages = find_packages(path)
     for mesh in root.iter("mesh"):
         if (uri := mesh.find("uri")) is not None:
-            uri.text = _resolve_mesh(path, (uri.text or "").strip(), packages).as_uri()
+            uri.text = mesh_uri(_resolve_mesh(path, (uri.text or "").strip(), packages))
         elif filename := mesh.get("filename"):
-            mesh.set("filename", _resolve_mesh(path, filename, packages).as_uri())
+            mesh.set("filename", mesh_uri(_resolve_mesh(path, filename, packages)))
     return ElementTree.tostring(root, encoding="unicode")
 
 
