@@ -1,5 +1,6 @@
 """Atomic writing of files, output folders, and errors in user input."""
 
+import errno
 import hashlib
 import json
 import os
@@ -15,6 +16,22 @@ from typing import Any
 
 MAX_MESSAGE_LENGTH = 300
 """Largest number of characters of a message after the name of its file; the rest is cut."""
+
+_INTERRUPTED = 130
+"""Exit code of an interrupted program, 128 + SIGINT."""
+_STORAGE_ERRORS = frozenset(
+    {
+        errno.EACCES,
+        errno.EDQUOT,
+        errno.EFBIG,
+        errno.EIO,
+        errno.ENAMETOOLONG,
+        errno.ENOSPC,
+        errno.EPERM,
+        errno.EROFS,
+    }
+)
+"""Errors of the file system that have their cause in the machine, not in the program."""
 
 
 class InputError(ValueError):
@@ -48,25 +65,52 @@ def format_value(value: Any) -> str:
 
 @contextmanager
 def cli_error_handler() -> Iterator[None]:
-    """Print an `InputError` as one line and exit with code 2; exit with 130 if interrupted."""
+    """Print an error that the user can mend as one line and exit with code 2.
+
+    These are an `InputError`, and files that cannot be written. An interruption has a line of its
+    own and exit code 130.
+    """
     try:
         yield
     except InputError as error:
         print(f"error {error}", file=sys.stderr)
         sys.exit(2)
+    except OSError as error:
+        if error.errno not in _STORAGE_ERRORS:
+            raise
+        place = error.filename2 or error.filename or "a file"  # the second one is a target
+        problem = f"cannot be written or read ({os.strerror(error.errno)})"
+        print(f"error {place}: {problem}; finished results are kept", file=sys.stderr)
+        sys.exit(2)
     except KeyboardInterrupt:
-        print("interrupted; finished results are kept", file=sys.stderr)
-        sys.exit(130)
+        _print_interruption()
+        sys.exit(_INTERRUPTED)
+    except SystemExit as error:
+        # Typer turns a KeyboardInterrupt into this exit code.
+        if error.code == _INTERRUPTED:
+            _print_interruption()
+        raise
+
+
+def _print_interruption() -> None:
+    print("interrupted; finished results are kept", file=sys.stderr)
 
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Yield a temporary path, which replaces `path` when the block ends without an error."""
+    """Yield a temporary path, which replaces `path` when the block ends without an error.
+
+    An `OSError` without a file name, such as that of a full disk, gets the name of `path`.
+    """
     # The random part separates processes. The suffix is kept for writers that infer the format.
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
     try:
         yield temporary
         os.replace(temporary, path)
+    except OSError as error:
+        if error.filename in (None, str(temporary)):
+            error.filename = str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -4,7 +4,7 @@ import json
 import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -140,5 +140,6 @@ def show_recording(
         return
     meshcat = serve_recording(scene, frames, cell)
     print_line(f"Showing {name} at {meshcat.web_url()}; press Ctrl-C to stop.")
-    while True:
-        time.sleep(1)
+    with suppress(KeyboardInterrupt):
+        while True:
+            time.sleep(1)

@@ -1,13 +1,15 @@
 """Images of the cameras of a work cell."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from drake_clutter.cell.camera import Camera
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import write_json
+from drake_clutter.files import atomic_write, write_json
 from drake_clutter.reports.scene_images import SceneRenderer
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.simulation.camera_renderer import CameraRenderer
@@ -38,8 +40,14 @@ def render_scene(scene: Scene, config: ClutterConfig, out: Path) -> dict[str, fl
         _write_camera_images(scene, camera, out, f"{name}_" if len(cameras) > 1 else "")
         for name, camera in cameras.items()
     ]
-    Image.fromarray(SceneRenderer().render_oblique(scene)).save(out / "picture.png")
+    _write_png(out / "picture.png", SceneRenderer().render_oblique(scene))
     return visible_fractions[0]
+
+
+def _write_png(path: Path, pixels: NDArray[Any]) -> None:
+    """Write an image atomically."""
+    with atomic_write(path) as temporary:
+        Image.fromarray(pixels).save(temporary)
 
 
 def _write_camera_images(scene: Scene, config: Camera, out: Path, prefix: str) -> dict[str, float]:
@@ -49,9 +57,9 @@ def _write_camera_images(scene: Scene, config: Camera, out: Path, prefix: str) -
     visible_fractions = camera.visible_fractions(scene)
     depth = np.rint(images.depth / DEPTH_UNIT)
     depth = np.where(depth <= np.iinfo(np.uint16).max, depth, 0)
-    Image.fromarray(images.color).save(out / f"{prefix}color.png")
-    Image.fromarray(depth.astype(np.uint16)).save(out / f"{prefix}depth.png")
-    Image.fromarray((images.label + 1).astype(np.uint8)).save(out / f"{prefix}label.png")
+    _write_png(out / f"{prefix}color.png", images.color)
+    _write_png(out / f"{prefix}depth.png", depth.astype(np.uint16))
+    _write_png(out / f"{prefix}label.png", (images.label + 1).astype(np.uint8))
     hidden = list(camera.hidden_objects(visible_fractions))
     write_json(
         out / f"{prefix}visible.json",

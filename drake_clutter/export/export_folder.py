@@ -71,6 +71,9 @@ def export_scene(scene: Scene, format: ExportFormat, out: Path) -> Path:
         # The file to open is moved last, so that its presence means a complete export.
         for entry in sorted(staging.iterdir(), key=lambda entry: (entry == main_file, entry.name)):
             os.replace(entry, out / entry.name)
+    except OSError as error:
+        error.filename = error.filename or str(out)  # a full disk has none
+        raise
     finally:
         shutil.rmtree(staging)
     return out / main_file.name

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
@@ -54,7 +54,7 @@ def save_checkpoint(path: Path, network: nn.Module, metadata: dict[str, Any]) ->
         metadata: See `Checkpoint`.
     """
     with atomic_write(path) as temporary:
-        save_file(_contiguous(network.state_dict()), temporary)
+        temporary.write_bytes(save(_contiguous(network.state_dict())))
     write_json(path.with_suffix(".json"), metadata)
 
 
@@ -89,7 +89,7 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], state: Any) -> None:
         state: Anything that JSON can represent.
     """
     with atomic_write(path) as temporary:
-        save_file(_contiguous(tensors), temporary, metadata={"state": json.dumps(state)})
+        temporary.write_bytes(save(_contiguous(tensors), {"state": json.dumps(state)}))
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], Any]:
