@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.validation import (
+    Count,
     InRange,
     NonNegative,
     config_class,
@@ -40,7 +41,7 @@ class LayoutConfig:
     max_stack_height: NonNegative = 0.50
     lying_gap: NonNegative = 0.002
     standing_gap: NonNegative = 0.050
-    placement_attempts: Annotated[int, InRange(1)] = 100
+    placement_attempts: Count = 100
 
 
 @config_class
@@ -86,7 +87,7 @@ class SettleConfig:
     early_stop_speed: NonNegative = 0.0003
     early_stop_displacement: NonNegative = 0.001
     early_stop_tilt_deg: NonNegative = 0.3
-    early_stop_samples: Annotated[int, InRange(1)] = 4
+    early_stop_samples: Count = 4
     chatter_displacement: NonNegative = 0.0005
 
 
@@ -103,7 +104,7 @@ class ExplorationConfig:
         release_height: Height above its support at which an object is released [m].
     """
 
-    max_moves: Annotated[int, InRange(1)] = 10
+    max_moves: Count = 10
     detection_reward: NonNegative = 1.0
     collapse_penalty: Annotated[float, InRange(-1e300, 0.0)] = -1.0
     clearance: NonNegative = 0.010

@@ -26,6 +26,7 @@ from pydantic import (
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
 
 from drake_clutter.files import format_value, input_error
+from drake_clutter.limits import MAX_COUNT, MAX_NETWORK_WIDTH, MAX_NODES, MAX_SEED
 from drake_clutter.yaml_io import parse_yaml, read_yaml, to_yaml
 
 Schema = TypeVar("Schema")
@@ -111,6 +112,16 @@ Fraction = Annotated[float, InRange(0.0, 1.0)]
 """A number from 0 to 1."""
 Integer = Annotated[int, InRange(-math.inf, math.inf)]
 """Any whole number."""
+Count = Annotated[int, InRange(1, MAX_COUNT)]
+"""A number of things of which there is at least one."""
+CountOrZero = Annotated[int, InRange(0, MAX_COUNT)]
+"""A number of things of which there may be none."""
+NetworkWidth = Annotated[int, InRange(1, MAX_NETWORK_WIDTH)]
+"""A width of the embeddings of a network."""
+NodeCount = Annotated[int, InRange(3, MAX_NODES)]
+"""A number of nodes of a scene graph: at least tray, one object and end."""
+Seed = Annotated[int, InRange(0, MAX_SEED)]
+"""A random seed."""
 Flag = Annotated[bool, Strict()]
 """True or false."""
 NonEmptyText = Annotated[str, Field(strict=True, min_length=1)]

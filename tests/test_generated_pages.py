@@ -118,13 +118,13 @@ def test_command_line_page_has_every_option() -> None:
     text = cli_page.page()
     for option in ("--scenario FILE", "--cell FILE", "--set FIELD=VALUE", "--workers"):
         assert f"`{option}" in text
-    assert rows_of(text, "`--seed <int range>`")[0][2] == "default: 0; x>=0"
+    assert rows_of(text, "`--seed <int range>`")[0][2] == "default: 0; 0<=x<=9223372036854775807"
 
 
 def test_configuration_page_has_types_defaults_and_ranges() -> None:
     text = configuration_page.page()
     assert rows_of(text, "`standing_gap`")[0][1:4] == ["number", "0.05", "≥ 0"]
-    assert rows_of(text, "`nodes`")[0][1:4] == ["integer", "25", "3 to 1000"]
+    assert rows_of(text, "`nodes`")[0][1:4] == ["integer", "25", "3 to 200"]
     assert rows_of(text, "`size`")[0][1:4] == ["list of 2 numbers", "required", "0.1 to 2"]
     assert rows_of(text, "`ik`")[0][3] == "`ur`, `numerical`"
 

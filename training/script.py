@@ -16,6 +16,7 @@ from rich.progress import track
 from rich.table import Table
 
 from drake_clutter.files import cli_error_handler
+from drake_clutter.limits import MAX_SEED, MAX_WORKERS
 
 Item = TypeVar("Item")
 
@@ -39,9 +40,12 @@ SettingsOption = Annotated[
 ResultsOption = Annotated[
     Path | None, typer.Option("--out", metavar="FILE", help="Results file to write (JSON).")
 ]
-WorkersOption = Annotated[int, typer.Option("--workers", min=1, help="Number of processes.")]
+WorkersOption = Annotated[
+    int, typer.Option("--workers", min=1, max=MAX_WORKERS, help="Number of processes.")
+]
 SeedOption = Annotated[
-    int, typer.Option("--seed", min=0, help="Seed. The same seed gives the same results.")
+    int,
+    typer.Option("--seed", min=0, max=MAX_SEED, help="Seed. The same seed gives the same results."),
 ]
 
 

@@ -9,7 +9,6 @@ is resumed by the same command, and ends with the same weights as an uninterrupt
 
 from dataclasses import field
 from pathlib import Path
-from typing import Annotated
 
 from drake_clutter.agents.behavior_cloning import BehaviorCloningConfig, BehaviorCloningLearner
 from drake_clutter.agents.explorer_training import CHECKPOINT_FILE, ExplorerTrainingConfig
@@ -19,7 +18,7 @@ from drake_clutter.config import upgrade_config
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, resolve_device
-from drake_clutter.validation import InRange, config_class, load_config_as
+from drake_clutter.validation import Count, config_class, load_config_as
 from training.script import ConfigOption, SettingsOption, run_script
 from training.training_loop import DeviceOption, Metrics, OutOption, train_to_end
 
@@ -35,7 +34,7 @@ class DAggerTrainingConfig(ExplorerTrainingConfig):
     """
 
     teacher: str = "training/checkpoints/teacher.safetensors"
-    evaluate_every: Annotated[int, InRange(1)] = 5
+    evaluate_every: Count = 5
     learning: BehaviorCloningConfig = field(default_factory=BehaviorCloningConfig)
 
 

@@ -9,7 +9,6 @@ uninterrupted one.
 
 from dataclasses import field
 from pathlib import Path
-from typing import Annotated
 
 from drake_clutter.agents.explorer_training import CHECKPOINT_FILE, ExplorerTrainingConfig
 from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, explorer_metadata, load_explorer
@@ -19,7 +18,7 @@ from drake_clutter.config import upgrade_config
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, resolve_device
-from drake_clutter.validation import Flag, InRange, config_class, load_config_as
+from drake_clutter.validation import Count, Flag, config_class, load_config_as
 from training.script import ConfigOption, SettingsOption, run_script
 from training.training_loop import DeviceOption, Metrics, OutOption, train_to_end
 
@@ -39,7 +38,7 @@ class PPOTrainingConfig(ExplorerTrainingConfig):
 
     privileged: Flag = True
     warm_start: str = ""
-    evaluate_every: Annotated[int, InRange(1)] = 15_000
+    evaluate_every: Count = 15_000
     learning: PPOConfig = field(default_factory=PPOConfig)
 
 

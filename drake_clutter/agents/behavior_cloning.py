@@ -8,7 +8,7 @@ on, so that it is also trained in states that only its own mistakes lead to.
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -33,7 +33,14 @@ from drake_clutter.learning.checkpoint import (
 from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.exploration_graph import RENAMED_ARRAYS, ExplorationObservation
-from drake_clutter.validation import Flag, InRange, NonNegative, config_class, renamed_fields
+from drake_clutter.validation import (
+    Count,
+    Flag,
+    NetworkWidth,
+    NonNegative,
+    config_class,
+    renamed_fields,
+)
 
 
 @config_class
@@ -56,13 +63,13 @@ class BehaviorCloningConfig:
         width: Width of the network's embeddings.
     """
 
-    iterations: Annotated[int, InRange(1)] = 40
-    episodes_per_iteration: Annotated[int, InRange(1)] = 100
+    iterations: Count = 40
+    episodes_per_iteration: Count = 100
     dagger: Flag = True
-    updates_per_iteration: Annotated[int, InRange(1)] = 400
-    batch_size: Annotated[int, InRange(1)] = 128
+    updates_per_iteration: Count = 400
+    batch_size: Count = 128
     learning_rate: NonNegative = 1e-3
-    width: Annotated[int, InRange(1)] = 32
+    width: NetworkWidth = 32
 
 
 class BehaviorCloningLearner:

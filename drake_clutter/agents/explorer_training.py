@@ -14,7 +14,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.episode import current_fidelity
-from drake_clutter.validation import InRange, config_class, renamed_fields
+from drake_clutter.validation import Count, InRange, Seed, config_class, renamed_fields
 
 CHECKPOINT_FILE = "explorer.safetensors"
 """Name of the checkpoint that a training writes to its run folder."""
@@ -38,11 +38,11 @@ class ExplorerTrainingConfig:
 
     scenes: str = "training/scenes/train_sg_star.json"
     catalog: str = ""
-    seed: Annotated[int, InRange(0)] = 0
+    seed: Seed = 0
     fidelity: Annotated[str, AfterValidator(current_fidelity)] = "static"
-    max_moves: Annotated[int, InRange(1)] = 20
+    max_moves: Count = 20
     max_objects: Annotated[int, InRange(1, 64)] = 24
-    evaluation_episodes: Annotated[int, InRange(1)] = 200
+    evaluation_episodes: Count = 200
     world: ClutterConfig = field(default_factory=ClutterConfig)
 
     def make_environment(self, *, privileged: bool = False) -> ClutterExploration:

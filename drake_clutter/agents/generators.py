@@ -40,7 +40,7 @@ from drake_clutter.validation import to_plain
 
 SEARCH_BUDGET = 400
 """Maximum number of moves that are evaluated to decide whether a scene is solvable."""
-MAX_LAYOUT_ATTEMPTS = 1000
+MAX_LAYOUT_ATTEMPTS = 300
 """Maximum number of graphs in a row that cannot be laid out.
 
 More failures mean that graphs of this size do not fit on the support.
@@ -251,7 +251,7 @@ class SceneGenerator:
             The scene, and the number of graphs before it that could not be laid out, by reason.
 
         Raises:
-            RuntimeError: `MAX_LAYOUT_ATTEMPTS` graphs in a row could not be laid out.
+            InputError: `MAX_LAYOUT_ATTEMPTS` graphs in a row could not be laid out.
         """
         failures: Counter[str] = Counter()
         for _ in range(MAX_LAYOUT_ATTEMPTS):
@@ -262,9 +262,10 @@ class SceneGenerator:
             if not isinstance(scene, LayoutFailure):
                 return scene, failures
             failures[scene.reason.value] += 1
-        raise RuntimeError(
-            f"{MAX_LAYOUT_ATTEMPTS} graphs of {self._job.nodes} nodes in a row could not be laid "
-            f"out: {dict(failures)}"
+        reasons = ", ".join(f"{count} times {reason}" for reason, count in failures.items())
+        raise InputError(
+            f"nodes: {self._job.nodes}; {MAX_LAYOUT_ATTEMPTS} graphs in a row could not be laid "
+            f"out ({reasons}); expected fewer nodes, or a larger support"
         )
 
 

@@ -28,7 +28,14 @@ from drake_clutter.learning.checkpoint import (
 )
 from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
-from drake_clutter.validation import InRange, NonNegative, config_class, renamed_fields
+from drake_clutter.validation import (
+    Count,
+    InRange,
+    NetworkWidth,
+    NonNegative,
+    config_class,
+    renamed_fields,
+)
 
 MIN_LEARNING_RATE_FRACTION = 0.02
 """Fraction of the initial learning rate below which the rate is not annealed.
@@ -66,17 +73,17 @@ class PPOConfig:
         width: Width of the network's embeddings.
     """
 
-    total_timesteps: Annotated[int, InRange(1)] = 150_000
-    episodes_per_iteration: Annotated[int, InRange(1)] = 96
-    update_epochs: Annotated[int, InRange(1)] = 4
-    minibatch_size: Annotated[int, InRange(1)] = 256
+    total_timesteps: Count = 150_000
+    episodes_per_iteration: Count = 96
+    update_epochs: Count = 4
+    minibatch_size: Count = 256
     gamma: Annotated[float, InRange(0.0, 1.0)] = 0.95
     gae_lambda: Annotated[float, InRange(0.0, 1.0)] = 0.9
     clip_coef: Annotated[float, InRange(1e-06)] = 0.2
     ent_coef: NonNegative = 0.01
     vf_coef: NonNegative = 0.5
     learning_rate: NonNegative = 1e-3
-    width: Annotated[int, InRange(1)] = 32
+    width: NetworkWidth = 32
 
 
 class PPOLearner:

@@ -39,7 +39,15 @@ from drake_clutter.learning.checkpoint import (
 )
 from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.generation_task import ClutterGeneration, GenerationObservation
-from drake_clutter.validation import InRange, NonNegative, config_class, renamed_fields
+from drake_clutter.validation import (
+    Count,
+    CountOrZero,
+    InRange,
+    NetworkWidth,
+    NonNegative,
+    config_class,
+    renamed_fields,
+)
 
 NUM_GRADIENT_SHARDS = 2
 """Number of parts into which the batch of an update is split.
@@ -84,19 +92,19 @@ class SoftQConfig:
         width: Width of the network's embeddings.
     """
 
-    total_timesteps: Annotated[int, InRange(1)] = 640_000
-    num_envs: Annotated[int, InRange(1)] = 32
-    batch_size: Annotated[int, InRange(1)] = 128
-    sequence_length: Annotated[int, InRange(1)] = 8
+    total_timesteps: Count = 640_000
+    num_envs: Count = 32
+    batch_size: Count = 128
+    sequence_length: Count = 8
     retrace_lambda: Annotated[float, InRange(0.0, 1.0)] = 0.95
-    train_frequency: Annotated[int, InRange(1)] = 4
-    buffer_size: Annotated[int, InRange(1)] = 100_000
-    learning_starts: Annotated[int, InRange(0)] = 4_000
+    train_frequency: Count = 4
+    buffer_size: Count = 100_000
+    learning_starts: CountOrZero = 4_000
     learning_rate: NonNegative = 1e-3
-    lr_halving_steps: Annotated[int, InRange(1)] = 128_000
+    lr_halving_steps: Count = 128_000
     temperature: Annotated[float, InRange(1e-06)] = 0.25
     tau: Annotated[float, InRange(0.0, 1.0)] = 0.005
-    width: Annotated[int, InRange(1)] = 32
+    width: NetworkWidth = 32
 
 
 class SampledEpisode(NamedTuple):

@@ -16,6 +16,7 @@ from pydrake.math import RigidTransform
 from drake_clutter.cell.pinhole import MAX_DEPTH, MIN_DEPTH, Floats, Pinhole
 from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.cell.support import Support
+from drake_clutter.limits import MAX_IMAGE_SIDE
 from drake_clutter.validation import Flag, InRange, StrictModel
 
 D435_FOV_Y_DEG = 42.5
@@ -55,8 +56,8 @@ class Camera(StrictModel):
     """
 
     pose: PoseSpec
-    width: Annotated[int, InRange(16, 4096)] = 640
-    height: Annotated[int, InRange(16, 4096)] = 480
+    width: Annotated[int, InRange(16, MAX_IMAGE_SIDE)] = 640
+    height: Annotated[int, InRange(16, MAX_IMAGE_SIDE)] = 480
     fov_y_deg: Annotated[float, InRange(1.0, 170.0)] = D435_FOV_Y_DEG
     visibility_threshold: Annotated[float, InRange(0.0, 1.0)] = 0.30
     depth_noise: Flag = True

@@ -20,6 +20,7 @@ from drake_clutter.cli.options import (
     WorkersOption,
 )
 from drake_clutter.cli.output import print_result, progress_bar
+from drake_clutter.limits import MAX_COUNT
 
 
 def generate(
@@ -40,7 +41,7 @@ def generate(
     ] = None,
     objects: ObjectsOption = "ycb7",
     nodes: NodesOption = 25,
-    count: Annotated[int, typer.Option(help="Number of scenes.")] = 100,
+    count: Annotated[int, typer.Option(max=MAX_COUNT, help="Number of scenes.")] = 100,
     seed: SeedOption = 0,
     workers: WorkersOption = 1,
     ray: RayOption = None,

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from drake_clutter.limits import MAX_COUNT, MAX_SEED, MAX_WORKERS
+
 
 class Fidelity(Enum):
     """Physical fidelity at which moves are executed."""
@@ -28,7 +30,13 @@ ResumableOutOption = Annotated[
     ),
 ]
 SeedOption = Annotated[
-    int, typer.Option("--seed", min=0, help="Random seed; the same seed gives the same result.")
+    int,
+    typer.Option(
+        "--seed",
+        min=0,
+        max=MAX_SEED,
+        help="Random seed; the same seed gives the same result.",
+    ),
 ]
 HtmlOption = Annotated[
     Path | None,
@@ -75,6 +83,7 @@ MaxMovesOption = Annotated[
     int | None,
     typer.Option(
         min=1,
+        max=MAX_COUNT,
         help="Maximum number of moves per episode. Default: `exploration.max_moves`, which is 10.",
     ),
 ]
@@ -89,7 +98,10 @@ ExplorerOption = Annotated[
 WorkersOption = Annotated[
     int,
     typer.Option(
-        "--workers", min=1, help="Number of worker processes; the result does not depend on it."
+        "--workers",
+        min=1,
+        max=MAX_WORKERS,
+        help="Number of worker processes; the result does not depend on it.",
     ),
 ]
 RayOption = Annotated[

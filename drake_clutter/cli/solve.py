@@ -17,13 +17,17 @@ from drake_clutter.cli.options import (
 )
 from drake_clutter.cli.output import print_result, print_transition
 from drake_clutter.files import prepare_output_directory
+from drake_clutter.limits import MAX_COUNT
 
 
 def solve(
     scene: SceneArgument,
     out: OutOption,
     budget: Annotated[
-        int, typer.Option(min=1, help="Maximum number of moves that the search may evaluate.")
+        int,
+        typer.Option(
+            min=1, max=MAX_COUNT, help="Maximum number of moves that the search may evaluate."
+        ),
     ] = 5000,
     seed: SeedOption = 0,
     catalog: CatalogOption = None,

@@ -15,6 +15,7 @@ from drake_clutter.grammar.production_rules import (
     ProductionRule,
     make_production_rules,
 )
+from drake_clutter.limits import MAX_NODES
 
 MIN_NODES = 3
 """Size of the smallest scene: tray, one object, end."""
@@ -33,9 +34,10 @@ class NodeBudget:
     exact: bool = True
 
     def __post_init__(self) -> None:
-        if self.nodes < MIN_NODES:
+        if not MIN_NODES <= self.nodes <= MAX_NODES:
             raise InputError(
-                f"nodes: {self.nodes}; expected {MIN_NODES} (tray, one object, end) or more"
+                f"nodes: {self.nodes}; expected {MIN_NODES} (tray, one object, end) or more, "
+                f"up to {MAX_NODES}"
             )
 
 

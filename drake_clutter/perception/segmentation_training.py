@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -31,7 +31,7 @@ from drake_clutter.perception.segmentation import (
     segmentation_loss,
 )
 from drake_clutter.seeding import item_rng
-from drake_clutter.validation import InRange, NonNegative, config_class, renamed_fields
+from drake_clutter.validation import Count, NonNegative, config_class, renamed_fields
 
 WARM_UP_FRACTION = 0.1
 """Fraction of the steps in which the learning rate rises."""
@@ -55,8 +55,8 @@ class SegmentationConfig:
         vote_weight: Weight of the votes' error relative to the cross entropy [1/m].
     """
 
-    steps: Annotated[int, InRange(1)] = 5000
-    batch_size: Annotated[int, InRange(1)] = 8
+    steps: Count = 5000
+    batch_size: Count = 8
     learning_rate: NonNegative = 3e-3
     weight_decay: NonNegative = 1e-4
     vote_weight: NonNegative = 5.0

@@ -1,8 +1,6 @@
 """Parameters of the pick-and-place planner."""
 
-from typing import Annotated
-
-from drake_clutter.validation import Flag, InRange, NonNegative, config_class, renamed_fields
+from drake_clutter.validation import CountOrZero, Flag, NonNegative, config_class, renamed_fields
 
 
 @config_class
@@ -46,9 +44,9 @@ class PlannerConfig:
     lift_height: NonNegative = 0.020
     lip_gap: NonNegative = 0.0005
     grasp_spacing: NonNegative = 0.012
-    max_grasps: Annotated[int, InRange(0)] = 9
-    num_yaws: Annotated[int, InRange(0)] = 12
-    max_attempts: Annotated[int, InRange(0)] = 400
+    max_grasps: CountOrZero = 9
+    num_yaws: CountOrZero = 12
+    max_attempts: CountOrZero = 400
     min_payload_acceleration: NonNegative = 0.3
     time_limit: NonNegative = 600.0
     max_guarded_descent: NonNegative = 0.0

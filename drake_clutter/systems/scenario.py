@@ -2,7 +2,6 @@
 
 from dataclasses import field
 from pathlib import Path
-from typing import Annotated
 
 from drake_clutter.agents.explorers import BASELINE_POLICIES, ORACLE, make_policy_factory
 from drake_clutter.catalog import load_catalog
@@ -13,7 +12,7 @@ from drake_clutter.learning.pretrained import checkpoint_path
 from drake_clutter.perception.depth_noise import DepthNoise
 from drake_clutter.systems.perception_system import LearnedPerception, PerceptionFn
 from drake_clutter.tasks.belief import Policy
-from drake_clutter.validation import InRange, config_class, renamed_fields
+from drake_clutter.validation import Count, NodeCount, Seed, config_class, renamed_fields
 
 
 @config_class
@@ -40,11 +39,11 @@ class Scenario:
     catalog: str = ""
     generator: str = "sg-star"
     objects: str = "ycb7"
-    nodes: Annotated[int, InRange(3, 1000)] = 25
+    nodes: NodeCount = 25
     agent: str = "student"
     perception: str = "labels"
-    max_moves: Annotated[int, InRange(1)] = 20
-    seed: Annotated[int, InRange(0)] = 0
+    max_moves: Count = 20
+    seed: Seed = 0
     world: ClutterConfig = field(default_factory=ClutterConfig)
 
 

@@ -29,7 +29,14 @@ from drake_clutter.scenes.interfaces import InconclusiveVerdict, Verdict
 from drake_clutter.scenes.layout import LayoutFailure, Stack, lay_out
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.stability.static_judge import StaticStabilityJudge
-from drake_clutter.validation import Flag, InRange, NonNegative, config_class, renamed_fields
+from drake_clutter.validation import (
+    Flag,
+    InRange,
+    NodeCount,
+    NonNegative,
+    config_class,
+    renamed_fields,
+)
 
 MAX_BALANCED_STACK_FRACTION = 0.6
 """Largest fraction of a balanced scene's objects that may be in one stack."""
@@ -58,7 +65,7 @@ class GenerationTaskConfig:
             random offsets of poses, so that simulations in Drake agree with the judge.
     """
 
-    nodes: Annotated[int, InRange(3, 1000)] = 25
+    nodes: NodeCount = 25
     hidden_reward: NonNegative = 0.5
     balance_reward: NonNegative = 0.5
     instability_reward: Annotated[float, InRange(-1e300, 0.0)] = -1.0
