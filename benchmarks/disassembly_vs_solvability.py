@@ -7,7 +7,6 @@ The generators' reward asks that a scene can be disassembled from the top, which
 scene is solvable if the oracle search reveals all objects.
 """
 
-import json
 from collections import Counter
 from pathlib import Path
 from typing import Annotated
@@ -15,10 +14,14 @@ from typing import Annotated
 import typer
 
 from drake_clutter.catalog import load_catalog
-from drake_clutter.commands.generate_scenes import PROGRESS_FILE, SCENES_FOLDER
+from drake_clutter.commands.generate_scenes import (
+    PROGRESS_FILE,
+    SCENES_FOLDER,
+    read_generation_progress,
+)
 from drake_clutter.commands.job_file import JOB_FILE
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import write_json
+from drake_clutter.files import read_json, write_json
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.statistics import wilson_interval
@@ -36,8 +39,8 @@ def count_scenes(folder: Path) -> Row:
     Args:
         folder: Folder that `drake-clutter generate` wrote.
     """
-    job = json.loads((folder / JOB_FILE).read_text())
-    answers = json.loads((folder / PROGRESS_FILE).read_text())["solvable"]
+    job = read_json(folder / JOB_FILE, "the options of a job")
+    answers = read_generation_progress(folder / PROGRESS_FILE).solvable
     catalog = load_catalog()
     judge = StaticStabilityJudge(ClutterConfig())
     counts = Counter[tuple[bool, bool]]()
@@ -45,7 +48,7 @@ def count_scenes(folder: Path) -> Row:
         file = load_scene(folder / SCENES_FOLDER / f"{index:04d}.yaml", catalog)
         if file.verdict is not None and file.verdict.stable:
             is_disassemblable = judge.is_disassemblable(file.settled_scene) is True
-            counts[is_disassemblable, answer == Solvability.SOLVABLE.value] += 1
+            counts[is_disassemblable, answer is Solvability.SOLVABLE] += 1
     row: Row = {key: job[key] for key in ("agent", "objects", "nodes", "seed")}
     row["scenes"] = len(answers)
     for name, is_disassemblable in (("comes_apart", True), ("does_not", False)):

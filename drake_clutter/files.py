@@ -34,8 +34,134 @@ _STORAGE_ERRORS = frozenset(
 """Errors of the file system that have their cause in the machine, not in the program."""
 
 
+MAX_ERROR_LENGTH = 500
+"""Largest number of characters of a whole error message; more than a terminal shows at a glance."""
+
+
 class InputError(ValueError):
-    """Unusable file, option or value from the user. The message states what is allowed."""
+    """Unusable file, option or value from the user. The message states what is allowed.
+
+    The message is one line of at most `MAX_ERROR_LENGTH` characters; a longer one loses its middle.
+    """
+
+    def __init__(self, message: str) -> None:
+        line = _single_line(message)
+        if len(line) > MAX_ERROR_LENGTH:
+            line = f"{line[:295]} ... {line[-200:]}"
+        super().__init__(line)
+
+
+def _single_line(text: str) -> str:
+    """Return a text without line breaks, other control characters and lone surrogates."""
+    line = " ".join(text.split())
+    return line if line.isprintable() else "".join(c if c.isprintable() else "?" for c in line)
+
+
+@contextmanager
+def reading_file(source: str | Path, allowed_content: str) -> Iterator[None]:
+    """Turn whatever a reader raises into an `InputError` that names the file.
+
+    A reader validates its file field by field where it can. This covers what remains: files that
+    are missing, cut off or damaged, and content that the libraries of their formats refuse.
+
+    Args:
+        source: The file.
+        allowed_content: What the file may contain, for the message.
+
+    Raises:
+        InputError: The block raised an exception.
+    """
+    try:
+        yield
+    except InputError as error:
+        if str(source) in str(error):
+            raise
+        raise input_error(str(source), str(error)) from error
+    except Exception as error:  # many types: each library of a format has its own
+        reason = _single_line(_describe_error(error))
+        if len(reason) > 140:
+            reason = f"{reason[:136]} ..."
+        raise input_error(
+            str(source), f"cannot be read ({reason}); expected {allowed_content}"
+        ) from error
+
+
+def _describe_error(error: Exception) -> str:
+    """Return the reason of an error in words."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    if isinstance(error, UnicodeDecodeError):
+        return error.reason
+    if isinstance(error, KeyError):
+        return f"lacks {format_value(error.args[0]) if error.args else 'a field'}"
+    if isinstance(error, RecursionError):
+        return "is nested too deeply"
+    return str(error) or type(error).__name__
+
+
+def read_text(path: Path, allowed_content: str) -> str:
+    """Return the content of a text file.
+
+    Args:
+        path: The file.
+        allowed_content: What the file may contain, for the message.
+
+    Raises:
+        InputError: The file cannot be read or is not UTF-8.
+    """
+    with reading_file(path, allowed_content):
+        return path.read_text(encoding="utf-8")
+
+
+def read_json(path: Path, allowed_content: str) -> Any:
+    """Return the document of a JSON file.
+
+    Args:
+        path: The file.
+        allowed_content: What the file may contain, for the message.
+
+    Raises:
+        InputError: The file cannot be read or is not JSON; see `parse_json`.
+    """
+    return parse_json(read_text(path, allowed_content), str(path), allowed_content)
+
+
+def parse_json(text: str, source: str, allowed_content: str, *, allow_nan: bool = False) -> Any:
+    """Return the document of a JSON text.
+
+    Args:
+        text: The text.
+        source: File of the text, for the message.
+        allowed_content: What the text may contain, for the message.
+        allow_nan: Whether NaN and Infinity, which JSON does not have, are numbers.
+
+    Raises:
+        InputError: The text is not JSON, or an object has a duplicate key.
+    """
+    try:
+        return json.loads(
+            text,
+            object_pairs_hook=_unique_keys,
+            parse_constant=None if allow_nan else _reject_constant,
+        )
+    except (ValueError, RecursionError) as error:
+        raise input_error(
+            source, f"is not JSON ({_describe_error(error)}); expected {allowed_content}"
+        ) from error
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the object of its keys and values."""
+    fields = dict(pairs)
+    if len(fields) < len(pairs):
+        keys = [key for key, _ in pairs]
+        duplicate = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"{format_value(duplicate)} is a duplicate key")
+    return fields
+
+
+def _reject_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a number of JSON")
 
 
 def input_error(source: str, message: str) -> InputError:

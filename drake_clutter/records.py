@@ -15,8 +15,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
-from drake_clutter.files import InputError, atomic_write
+from drake_clutter.files import InputError, atomic_write, input_error, parse_json, reading_file
 from drake_clutter.resources import git_commit
+
+_CONTENT = "a record file, unmodified"
+"""What a file may contain, for messages."""
 
 
 def read_jsonl(path: Path) -> list[Any]:
@@ -25,10 +28,17 @@ def read_jsonl(path: Path) -> list[Any]:
     Args:
         path: The file. For a compressed file, the journal of an interrupted run is read if it
             holds more records.
+
+    Raises:
+        InputError: The file cannot be read, or a line is not JSON.
     """
     journal = _journal_path(path)
-    lines = _complete_lines(journal.read_text(encoding="utf-8")) if journal.exists() else []
-    return [json.loads(line) for line in max(lines, _compressed_lines(path), key=len)]
+    lines: list[str] = []
+    if journal.exists():
+        with reading_file(journal, _CONTENT):
+            lines = _complete_lines(journal.read_text(encoding="utf-8"))
+    compressed = _compressed_lines(path)
+    return _parse_lines(lines if len(lines) > len(compressed) else compressed, path)
 
 
 def write_jsonl(path: Path, header: Any, records: Iterable[Any]) -> None:
@@ -62,21 +72,24 @@ def resume_jsonl(
         upgrade_header: Converts a header written by an earlier version to the current format.
 
     Raises:
-        InputError: The file has another header, or another process is appending to it.
+        InputError: The file cannot be read or has another header, or another process is appending
+            to it.
     """
     header = json.loads(json.dumps(header))
     path.parent.mkdir(parents=True, exist_ok=True)
     with _open_journal(path) as journal:
-        text = journal.read()
+        with reading_file(path, _CONTENT):
+            text = journal.read()
         lines, compressed = _complete_lines(text), _compressed_lines(path)
         if len(lines) < len(compressed) or not lines:
             lines = compressed or [json.dumps({**header, "commit": git_commit()}) + "\n"]
+        written_header, *records = _parse_lines(lines, path)
+        with reading_file(path, _CONTENT):
+            upgraded = upgrade_header(written_header)
         if text != "".join(lines):
             journal.truncate(0)
             journal.write("".join(lines))
             journal.flush()
-        written_header, *records = map(json.loads, lines)
-        upgraded = upgrade_header(written_header)
         differing = ", ".join(key for key, value in header.items() if upgraded.get(key) != value)
         if differing:
             raise InputError(
@@ -106,7 +119,19 @@ def _compressed_lines(path: Path) -> list[str]:
     """Return the lines of a compressed file; an empty list for any other file."""
     if path.suffix != ".gz" or not path.exists():
         return []
-    return gzip.decompress(path.read_bytes()).decode().splitlines(keepends=True)
+    with reading_file(path, _CONTENT):
+        return gzip.decompress(path.read_bytes()).decode().splitlines(keepends=True)
+
+
+def _parse_lines(lines: Iterable[str], path: Path) -> list[Any]:
+    """Return the documents of the lines of a file, whose first is a JSON object."""
+    documents = []
+    for number, line in enumerate(lines, start=1):
+        document = parse_json(line, f"{path}: line {number}", _CONTENT, allow_nan=True)
+        if number == 1 and not isinstance(document, dict):
+            raise input_error(str(path), f"line 1: {line}; expected the header, a JSON object")
+        documents.append(document)
+    return documents
 
 
 def _write_compressed(path: Path, lines: Iterable[str]) -> None:

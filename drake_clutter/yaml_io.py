@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from drake_clutter.files import format_value, input_error
+from drake_clutter.files import format_value, input_error, read_text
 
 _EXPONENT_NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$")
 """Numbers such as 1e-3, which YAML 1.1 reads as strings."""
@@ -70,15 +70,7 @@ def read_yaml(path: Path, allowed_content: str) -> Any:
     Raises:
         InputError: The file cannot be read or is not YAML.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        problem = f"cannot be read ({error.strerror}); expected {allowed_content}"
-        raise input_error(str(path), problem) from error
-    except UnicodeDecodeError as error:
-        problem = f"is not YAML ({error.reason}); expected {allowed_content}"
-        raise input_error(str(path), problem) from error
-    return parse_yaml(text, str(path), allowed_content)
+    return parse_yaml(read_text(path, allowed_content), str(path), allowed_content)
 
 
 def parse_yaml(text: str, source: str, allowed_content: str = "YAML") -> Any:

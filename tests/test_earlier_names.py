@@ -178,6 +178,7 @@ class NoLearner:
     """A learner without state."""
 
     step: int = 0
+    network = torch.nn.Module()
 
     def save(self, path: Path) -> None:
         """See `Learner`."""

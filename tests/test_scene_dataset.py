@@ -80,7 +80,7 @@ def test_a_changed_set_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"set\.json: version: 7; expected 1"):
         load_scene_dataset(path, CATALOG)
     path.write_text(whole[:-20])
-    with pytest.raises(InputError, match=r"set\.json: is not a scene dataset"):
+    with pytest.raises(InputError, match=r"set\.json: is not JSON .*; expected a scene dataset"):
         load_scene_dataset(path, CATALOG)
     with pytest.raises(InputError, match=r"none\.json: cannot be read"):
         load_scene_dataset(tmp_path / "none.json", CATALOG)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from torch import nn
 
 from drake_clutter.files import InputError
 from drake_clutter.learning.training_run import CONFIG_FILE, TrainingRun
@@ -20,6 +21,7 @@ class NoLearner:
     """A learner that does nothing."""
 
     step = 0
+    network = nn.Module()
 
     def save(self, path: Path) -> None:
         """See `Learner`."""

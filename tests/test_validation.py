@@ -191,7 +191,7 @@ def test_unreadable_files(tmp_path: Path) -> None:
     ):
         read_yaml(tmp_path / "none.yaml", "a room")
     (tmp_path / "binary.yaml").write_bytes(b"\x89PNG\xff")
-    with pytest.raises(InputError, match=r"binary\.yaml: is not YAML \(invalid start byte\)"):
+    with pytest.raises(InputError, match=r"binary\.yaml: cannot be read \(invalid start byte\)"):
         read_yaml(tmp_path / "binary.yaml", "a room")
 
 

@@ -15,7 +15,6 @@ The verdicts are kept in the folder `--work`. An interrupted run is resumed by t
 """
 
 import itertools
-import json
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import closing
@@ -27,7 +26,12 @@ import typer
 
 from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.catalog import load_catalog
-from drake_clutter.commands.generate_scenes import PROGRESS_FILE, SCENES_FOLDER, generate_scenes
+from drake_clutter.commands.generate_scenes import (
+    PROGRESS_FILE,
+    SCENES_FOLDER,
+    generate_scenes,
+    read_generation_progress,
+)
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import canonical_form
@@ -54,7 +58,7 @@ VERDICTS_FILE = "judged.jsonl"
 def read_stable_scenes(folder: Path) -> Iterator[SceneRecord]:
     """Yield the stable scenes with hidden objects of a folder that `generate` wrote."""
     catalog = load_catalog()
-    solvable = json.loads((folder / PROGRESS_FILE).read_text())["solvable"]
+    solvable = read_generation_progress(folder / PROGRESS_FILE).solvable
     for index, answer in enumerate(solvable):
         file = load_scene(folder / SCENES_FOLDER / f"{index:04d}.yaml", catalog)
         assert file.verdict is not None
@@ -62,9 +66,9 @@ def read_stable_scenes(folder: Path) -> Iterator[SceneRecord]:
         if file.verdict.stable and file.verdict.hidden:
             settled = tuple(file.verdict.settled[name] for name in file.scene.names)
             form = canonical_form(file.scene.graph, catalog.classes)
-            yield SceneRecord(
-                file.scene.derivation, form, len(file.verdict.hidden), answer, settled
-            )
+            solvability = "" if answer is None else answer.value
+            num_hidden = len(file.verdict.hidden)
+            yield SceneRecord(file.scene.derivation, form, num_hidden, solvability, settled)
 
 
 class GraphJudge:

@@ -5,7 +5,6 @@ A results file is a JSON document: what its rows have in common (seed, configura
 individual episodes or scenes that a row summarizes.
 """
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
@@ -15,10 +14,18 @@ from typing import Any
 
 import drake_clutter
 from drake_clutter.config import upgrade_header_configs
-from drake_clutter.files import InputError, write_json
+from drake_clutter.files import (
+    InputError,
+    format_value,
+    input_error,
+    read_json,
+    reading_file,
+    write_json,
+)
 from drake_clutter.records import resume_jsonl
 from drake_clutter.resources import git_commit
 from drake_clutter.tasks.episode import current_fidelity
+from drake_clutter.validation import validate
 from drake_clutter.workers.parallel_map import map_ordered
 from training.script import progress
 
@@ -59,16 +66,20 @@ class ResultsFile:
         Raises:
             InputError: The file is not a results file, or has another header.
         """
-        try:
-            document = upgrade_record_header(json.loads(self.path.read_text(encoding="utf-8")))
-            rows: list[Row] = document["rows"]
-            differing = [key for key, value in self.header.items() if document[key] != value]
-        except FileNotFoundError:
+        if not self.path.exists():
             return []
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(
-                f"--out {self.path}: is not a results file ({error}); expected one, or a new file"
-            ) from error
+        source = f"--out {self.path}"
+        content = "a results file, or a new file"
+        with reading_file(source, content):
+            document = upgrade_record_header(read_json(self.path, content))
+            rows = validate(list[Row], document["rows"], f"{source}: rows")
+            differing = [key for key, value in self.header.items() if document[key] != value]
+        for key in self.keys:
+            for row in rows:
+                if not isinstance(row.get(key, ...), str | int | float | None):
+                    raise input_error(
+                        source, f"rows: {key}: {format_value(row.get(key))}; expected {content}"
+                    )
         if differing:
             raise InputError(
                 f"--out {self.path}: holds results of another {', '.join(differing)}; give the same"

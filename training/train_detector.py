@@ -19,6 +19,7 @@ import typer
 from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.config import upgrade_config
+from drake_clutter.files import InputError
 from drake_clutter.learning.training_run import TrainingRun, resolve_device
 from drake_clutter.perception.image_dataset import ImageDataset
 from drake_clutter.perception.segmentation import CHECKPOINT_KIND, ImageWindow, SegmentationNetwork
@@ -28,7 +29,15 @@ from drake_clutter.perception.segmentation_training import (
     make_example,
 )
 from drake_clutter.seeding import item_rng
-from drake_clutter.validation import Flag, InRange, config_class, load_config_as, renamed_fields
+from drake_clutter.validation import (
+    Count,
+    CountOrZero,
+    Flag,
+    Seed,
+    config_class,
+    load_config_as,
+    renamed_fields,
+)
 from training.script import ConfigOption, SettingsOption, run_script
 from training.training_loop import DeviceOption, Metrics, OutOption, train_to_end
 
@@ -56,13 +65,13 @@ class DetectorTrainingConfig:
     """
 
     images: str = "runs/images"
-    held_out: Annotated[int, InRange(0)] = 200
+    held_out: CountOrZero = 200
     objects: str = "pantry14"
     catalog: str = ""
     use_color: Flag = False
     warm_start: str = ""
-    seed: Annotated[int, InRange(0)] = 0
-    evaluate_every: Annotated[int, InRange(1)] = 250
+    seed: Seed = 0
+    evaluate_every: Count = 250
     learning: SegmentationConfig = field(default_factory=SegmentationConfig)
     cell: WorkCell = field(default_factory=default_cell)
 
@@ -119,10 +128,10 @@ class HeldOutImages:
             ]
             has_error = bool(np.isfinite(errors).any())
             vote_errors.append(float(np.nanmedian(errors)) if has_error else np.nan)
-        return {
-            "iou": float(np.mean(intersections / np.maximum(unions, 1))),
-            "median_vote_mm": 1000 * float(np.nanmean(vote_errors)),
-        }
+        metrics = {"iou": float(np.mean(intersections / np.maximum(unions, 1)))}
+        if np.isfinite(vote_errors).any():  # False for a network that detects no object yet.
+            metrics["median_vote_mm"] = 1000 * float(np.nanmean(vote_errors))
+        return metrics
 
 
 def main(
@@ -140,6 +149,11 @@ def main(
     classes = [c.name for c in catalog.object_set(training.objects)]
     images = ImageDataset(Path(training.images))
     num_training_images = len(images) - training.held_out
+    if num_training_images < 1:
+        raise InputError(
+            f"held_out: {training.held_out}; expected fewer than the {len(images)} images of "
+            f"{training.images}"
+        )
     torch.manual_seed(training.seed)
     network = SegmentationNetwork(classes, training.use_color)
     if training.warm_start:

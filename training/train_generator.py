@@ -15,7 +15,12 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from drake_clutter.agents.learned_generator import load_rule_network, rule_network_metadata
+from drake_clutter.agents.learned_generator import (
+    CHECKPOINT_KIND,
+    load_generator_checkpoint,
+    load_rule_network,
+    rule_network_metadata,
+)
 from drake_clutter.agents.message_passing import limit_operations_to_one_thread
 from drake_clutter.agents.soft_q import (
     NUM_GRADIENT_SHARDS,
@@ -26,8 +31,8 @@ from drake_clutter.agents.soft_q import (
 )
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig, upgrade_config
+from drake_clutter.files import InputError
 from drake_clutter.grammar import canonical_form
-from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun, resolve_device
 from drake_clutter.tasks.generation_task import (
     MAX_BALANCED_STACK_FRACTION,
@@ -35,8 +40,9 @@ from drake_clutter.tasks.generation_task import (
     GenerationTaskConfig,
 )
 from drake_clutter.validation import (
-    InRange,
+    Count,
     NonNegative,
+    Seed,
     config_class,
     load_config_as,
     renamed_fields,
@@ -69,11 +75,11 @@ class GeneratorTrainingConfig:
 
     objects: str = "ycb7"
     catalog: str = ""
-    seed: Annotated[int, InRange(0)] = 0
+    seed: Seed = 0
     warm_start: str = ""
-    evaluate_every: Annotated[int, InRange(1)] = 32_000
-    evaluation_scenes: Annotated[int, InRange(1)] = 256
-    save_every: Annotated[int, InRange(1)] = 64_000
+    evaluate_every: Count = 32_000
+    evaluation_scenes: Count = 256
+    save_every: Count = 64_000
     sampling_temperature: NonNegative = 0.0
     task: GenerationTaskConfig = field(default_factory=GenerationTaskConfig)
     learning: SoftQConfig = field(default_factory=SoftQConfig)
@@ -134,7 +140,14 @@ def main(
     grammar = make_environment().grammar
     learner = SoftQLearner(make_environment, learning, training.seed, torch_device, threads)
     if training.warm_start:
-        learner.warm_start(load_rule_network(load_checkpoint(Path(training.warm_start)), grammar))
+        checkpoint = load_generator_checkpoint(Path(training.warm_start))
+        width = checkpoint.metadata["network"]["width"]
+        if width != learning.width:
+            raise InputError(
+                f"warm_start: {training.warm_start}: has width {width}; "
+                f"expected {learning.width} (learning.width)"
+            )
+        learner.warm_start(load_rule_network(checkpoint, grammar))
     run = TrainingRun(out, training, learner, learning.total_timesteps)
     losses = list[float]()
 
@@ -164,7 +177,7 @@ def main(
         save_every=training.save_every,
     )
     metadata = {
-        "kind": "generator",
+        "kind": CHECKPOINT_KIND,
         "network": rule_network_metadata(grammar, learning.width),
         "temperature": training.sampling_temperature or learning.temperature,
     }

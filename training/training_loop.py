@@ -49,6 +49,7 @@ def train_to_end(
     while learner.step < total_steps:
         before = learner.step
         train_iteration()
+        run.check_convergence()
         is_last = learner.step >= total_steps
         if is_last or learner.step // evaluate_every > before // evaluate_every:
             run.report(*evaluate())

@@ -8,14 +8,15 @@ object that the network chose, where it is less stable and occludes more.
 
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from drake_clutter.agents.explorer_network import ExplorerNetwork, collate_graphs, sample_actions
 from drake_clutter.config import ExplorationConfig
-from drake_clutter.files import InputError
-from drake_clutter.learning.checkpoint import Checkpoint, load_checkpoint
+from drake_clutter.files import InputError, format_value, input_error
+from drake_clutter.learning.checkpoint import Checkpoint, load_checkpoint, load_weights
 from drake_clutter.scenes.interfaces import Move, Observation
 from drake_clutter.scenes.placement import find_free_placements
 from drake_clutter.scenes.scene import TRAY
@@ -27,6 +28,7 @@ from drake_clutter.tasks.exploration_graph import (
     RENAMED_FEATURES,
     build_exploration_graph,
 )
+from drake_clutter.validation import NetworkWidth, NonEmptyText, StrictModel, validate
 
 TEACHER = "teacher"
 """Kind of the checkpoints of privileged policies."""
@@ -49,6 +51,15 @@ def explorer_metadata(node_kind_ids: dict[str, int], width: int) -> dict[str, An
     }
 
 
+class _NetworkEntry(StrictModel):
+    """The network in a checkpoint's metadata, see `explorer_metadata`."""
+
+    node_kinds: Annotated[tuple[NonEmptyText, ...], Field(min_length=1)]
+    features: tuple[NonEmptyText, ...] = ()
+    edge_kinds: tuple[NonEmptyText, ...] = ()
+    width: NetworkWidth
+
+
 def load_explorer(
     checkpoint: Checkpoint, path: Path, kind: str | None = None
 ) -> tuple[ExplorerNetwork, dict[str, int]]:
@@ -65,16 +76,13 @@ def load_explorer(
     metadata = checkpoint.metadata
     allowed = (TEACHER, STUDENT) if kind is None else (kind,)
     if metadata.get("kind") not in allowed:
-        raise InputError(
-            f"{path}: is a checkpoint of a {metadata.get('kind')}; "
-            f"expected one of a {' or '.join(allowed)}"
+        raise input_error(
+            str(path),
+            f"is a checkpoint of a {format_value(metadata.get('kind'))}; "
+            f"expected one of a {' or '.join(allowed)}",
         )
-    network_metadata = metadata.get("network", {})
-    if "node_kinds" not in network_metadata or "width" not in network_metadata:
-        raise InputError(
-            f"{path.with_suffix('.json')}: network: lacks node_kinds or width; "
-            "expected an unmodified file"
-        )
+    network_metadata: dict[str, Any] = metadata.get("network", {})
+    validate(_NetworkEntry, network_metadata, f"{path.with_suffix('.json')}: network")
     node_kind_ids = {
         name: number for number, name in enumerate(network_metadata["node_kinds"], start=1)
     }
@@ -86,13 +94,7 @@ def load_explorer(
             f"{path}: was trained on other features; expected a checkpoint of this version"
         )
     network = ExplorerNetwork(len(node_kind_ids), network_metadata["width"])
-    try:
-        network.load_state_dict(checkpoint.weights)
-    except RuntimeError as error:
-        raise InputError(
-            f"{path}: its weights do not fit {path.with_suffix('.json')}; "
-            "expected the files of one training"
-        ) from error
+    load_weights(network, checkpoint.weights, path)
     return network.eval(), node_kind_ids
 
 

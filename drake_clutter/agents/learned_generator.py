@@ -1,21 +1,66 @@
 """Scene generator that samples grammar rules from a trained Q-network."""
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from pydantic import BaseModel, Field
 
 from drake_clutter.agents.graph_network import RuleQNetwork
 from drake_clutter.agents.replay_buffer import collate
 from drake_clutter.agents.soft_q import sample_softmax_actions
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import InputError
+from drake_clutter.files import InputError, format_value, input_error
 from drake_clutter.grammar import Derivation, NodeBudget, SceneGrammar
-from drake_clutter.learning.checkpoint import Checkpoint, load_checkpoint
+from drake_clutter.learning.checkpoint import Checkpoint, load_checkpoint, load_weights
 from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.tasks.generation_task import GenerationTaskConfig, GraphVocabulary, PartialScene
-from drake_clutter.validation import validate
+from drake_clutter.validation import NetworkWidth, NonEmptyText, Positive, StrictModel, validate
+
+CHECKPOINT_KIND = "generator"
+"""Value of `kind` in the metadata of checkpoints."""
+
+
+class _NetworkEntry(StrictModel):
+    """The network in a checkpoint's metadata, see `rule_network_metadata`."""
+
+    node_kinds: Annotated[tuple[NonEmptyText, ...], Field(min_length=1)]
+    edge_kinds: Annotated[tuple[NonEmptyText, ...], Field(min_length=1)]
+    rules: Annotated[tuple[NonEmptyText, ...], Field(min_length=1)]
+    width: NetworkWidth
+
+
+class _ConfigEntry(BaseModel):
+    """What a generator needs of the configuration of its training."""
+
+    task: GenerationTaskConfig
+
+
+class _GeneratorMetadata(BaseModel):
+    """Metadata of a checkpoint of a scene generator."""
+
+    network: _NetworkEntry
+    temperature: Positive
+    config: _ConfigEntry
+
+
+def load_generator_checkpoint(path: Path) -> Checkpoint:
+    """Return a checkpoint of `train_generator.py`.
+
+    Raises:
+        InputError: The file cannot be read, or is not a checkpoint of a scene generator.
+    """
+    checkpoint = load_checkpoint(path)
+    kind = checkpoint.metadata.get("kind")
+    if kind != CHECKPOINT_KIND:
+        raise input_error(
+            str(path),
+            f"is a checkpoint of another kind ({format_value(kind)}); "
+            f"expected a {CHECKPOINT_KIND} of training/train_generator.py",
+        )
+    validate(_GeneratorMetadata, checkpoint.metadata, str(path.with_suffix(".json")))
+    return checkpoint
 
 
 def rule_network_metadata(grammar: SceneGrammar, width: int) -> dict[str, Any]:
@@ -51,7 +96,7 @@ def load_rule_network(checkpoint: Checkpoint, grammar: SceneGrammar) -> RuleQNet
     metadata = rule_network_metadata(grammar, trained_metadata["width"])
     network = _make_network(metadata)
     trained = _make_network(trained_metadata)
-    trained.load_state_dict(checkpoint.weights)
+    load_weights(trained, checkpoint.weights, checkpoint.path)
     state = network.state_dict()
     rows = _row_names(metadata)
     trained_rows = _row_names(trained_metadata)
@@ -108,13 +153,8 @@ class LearnedGenerator:
         """
         self._path = path
         self._config = config
-        self._checkpoint = load_checkpoint(path)
+        self._checkpoint = load_generator_checkpoint(path)
         metadata = self._checkpoint.metadata
-        if metadata.get("kind") != "generator":
-            raise InputError(
-                f"{path}: is a checkpoint of another kind; "
-                "expected one of training/train_generator.py"
-            )
         self._temperature = metadata["temperature"] if temperature is None else temperature
         task = validate(GenerationTaskConfig, metadata["config"]["task"], str(path))
         self._judge = StaticStabilityJudge(config, margin=task.contact_margin)

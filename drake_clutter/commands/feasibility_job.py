@@ -2,24 +2,23 @@
 
 import csv
 import io
-import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Self
 
 import numpy as np
-from pydantic import field_validator
+from pydantic import Strict, create_model, field_validator, model_validator
 
 from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.commands.job_file import open_job_folder
 from drake_clutter.config import ClutterConfig, upgrade_cell
-from drake_clutter.files import InputError, write_json, write_text
+from drake_clutter.files import InputError, read_json, write_json, write_text
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.reachability import ReachabilityAnalysis, score_base_positions
 from drake_clutter.reports.feasibility_report import write_feasibility_report
@@ -36,7 +35,11 @@ from drake_clutter.tasks.feasibility_study import (
     PoseErrorRecord,
 )
 from drake_clutter.validation import (
+    CountOrZero,
     Finite,
+    Flag,
+    Fraction,
+    Integer,
     NonEmptyText,
     StrictModel,
     Vector3,
@@ -369,15 +372,112 @@ def run_feasibility_study(
     num_done = len(parts) - len(remaining)
     for part, result in zip(remaining, progress(new_results, num_done, len(parts)), strict=True):
         write_json(folder / part.file_name, _nan_to_none(result))
-    return _write_results(job, out, {part: _read_part(folder / part.file_name) for part in parts})
+    return _write_results(job, out, {part: load_part(folder, part) for part in parts})
+
+
+@cache
+def _rows_schema(record: type[MoveRecord] | type[PoseErrorRecord]) -> Any:
+    """Return the schema of rows in a part file, where null stands for NaN."""
+    types: dict[Any, Any] = {
+        str: Annotated[str, Strict()],
+        int: Integer,
+        float: Finite | None,
+    }
+    columns: dict[str, Any] = {field.name: (types[field.type], ...) for field in fields(record)}
+    row = create_model(record.__name__, __base__=StrictModel, **columns)
+    return tuple[row, ...]  # type: ignore[valid-type]
+
+
+class _ScenePart(StrictModel):
+    """Moves that were planned in one scene."""
+
+    scene: NonEmptyText
+    unstable: Flag
+    moves: tuple[Any, ...]
+    pose_errors: tuple[Any, ...]
+
+
+class _BaseRow(StrictModel):
+    """Score of one base position."""
+
+    x: Finite
+    y: Finite
+    reachable_fraction: Fraction
+    manipulability: Finite | None
+
+
+class _BasePart(StrictModel):
+    """Scores of base positions."""
+
+    bases: tuple[_BaseRow, ...]
+
+
+class _TargetRow(StrictModel):
+    """Result of one target pose."""
+
+    target: NonEmptyText
+    num_solutions: CountOrZero
+    manipulability: Finite | None
+    q: tuple[Finite, ...] | None
+    blocking_bodies: Annotated[str, Strict()]
+
+
+class _ReachPart(StrictModel):
+    """Reachability map, by height, x and y, and results of the target poses."""
+
+    x: tuple[Finite, ...]
+    y: tuple[Finite, ...]
+    heights: tuple[Finite, ...]
+    reachable_fraction: tuple[tuple[tuple[Finite | None, ...], ...], ...]
+    manipulability: tuple[tuple[tuple[Finite | None, ...], ...], ...]
+    targets: tuple[_TargetRow, ...]
+
+    @model_validator(mode="after")
+    def _check_shape(self) -> Self:
+        shape = (len(self.heights), len(self.x), len(self.y))
+        for grid in (self.reachable_fraction, self.manipulability):
+            lengths = {(len(grid), len(plane), len(row)) for plane in grid for row in plane}
+            if lengths != {shape}:
+                raise allowed_error("grids of one value for each height, x and y")
+        return self
+
+
+def load_part(folder: Path, part: StudyPart) -> Any:
+    """Return the result of a part.
+
+    Args:
+        folder: Folder of the part files.
+        part: The part.
+
+    Raises:
+        InputError: The file cannot be read, or a field has a value that is not allowed.
+    """
+    path = folder / part.file_name
+    result = _read_part(path)
+    if part.scene_index is not None:
+        rows = validate(_ScenePart, result, str(path))
+        validate(_rows_schema(MoveRecord), rows.moves, f"{path}: moves")
+        validate(_rows_schema(PoseErrorRecord), rows.pose_errors, f"{path}: pose_errors")
+    elif part.base_x is not None:
+        validate(_BasePart, result, str(path))
+    else:
+        validate(_ReachPart, result, str(path))
+    return result
 
 
 def _read_part(path: Path) -> Any:
     """Return the result of a part with the field names of this version."""
-    return json.loads(
-        path.read_text(encoding="utf-8"),
-        object_hook=lambda fields: {_RENAMED_PART_FIELDS.get(k, k): v for k, v in fields.items()},
-    )
+    return _with_current_names(read_json(path, "a part of a feasibility study"))
+
+
+def _with_current_names(value: Any) -> Any:
+    """Return a document with the field names of this version."""
+    if isinstance(value, dict):
+        return {
+            _RENAMED_PART_FIELDS.get(key, key): _with_current_names(item)
+            for key, item in value.items()
+        }
+    return [_with_current_names(item) for item in value] if isinstance(value, list) else value
 
 
 def _nan_to_none(value: Any) -> Any:

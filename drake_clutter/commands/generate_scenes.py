@@ -3,7 +3,6 @@
 The result does not depend on the number of workers.
 """
 
-import json
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -13,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from drake_clutter.agents.generators import (
     GeneratedScene,
@@ -23,7 +23,7 @@ from drake_clutter.agents.generators import (
 )
 from drake_clutter.catalog import load_catalog
 from drake_clutter.commands.job_file import JOB_FILE, open_job_folder
-from drake_clutter.files import InputError, prepare_output_directory, write_json
+from drake_clutter.files import InputError, prepare_output_directory, read_json, write_json
 from drake_clutter.grammar import NodeBudget
 from drake_clutter.reports.contact_sheet import MAX_THUMBNAILS, write_contact_sheet
 from drake_clutter.reports.scene_images import SceneRenderer
@@ -31,13 +31,37 @@ from drake_clutter.scenes.interfaces import Verdict
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene, save_scene
 from drake_clutter.tasks.oracle_search import Solvability
-from drake_clutter.validation import to_plain
+from drake_clutter.validation import CountOrZero, NonNegative, StrictModel, to_plain, validate
 from drake_clutter.workers.parallel_map import map_ordered
 
 PROGRESS_FILE = "progress.json"
 SCENES_FOLDER = "scenes"
 SUMMARY_FILE = "summary.json"
 CONTACT_SHEET_FILE = "contact_sheet.png"
+
+
+class GenerationProgress(StrictModel):
+    """Content of `PROGRESS_FILE`.
+
+    Attributes:
+        seconds: Duration of the run so far [s].
+        layout_failures: Number of discarded layouts by reason.
+        solvable: Result of the oracle search of each scene; None if it was not run.
+    """
+
+    seconds: NonNegative = 0.0
+    layout_failures: dict[str, CountOrZero] = Field(default_factory=dict)
+    solvable: tuple[Solvability | None, ...] = ()
+
+
+def read_generation_progress(path: Path) -> GenerationProgress:
+    """Return the progress of a run of `generate`.
+
+    Raises:
+        InputError: The file cannot be read, or a field has a value that is not allowed.
+    """
+    document = read_json(path, "the progress of a run of generate")
+    return validate(GenerationProgress, document, str(path))
 
 
 @dataclass(frozen=True)
@@ -92,12 +116,11 @@ def generate_scenes(
     paths = [folder / f"{index:04d}.yaml" for index in range(count)]
     # Scenes are written in order, so the existing ones have the lowest indices.
     num_files = next((index for index, path in enumerate(paths) if not path.exists()), count)
-    earlier_run: dict[str, Any] = {}
+    earlier_run = GenerationProgress()
     if (out / PROGRESS_FILE).exists():
-        earlier_run = json.loads((out / PROGRESS_FILE).read_text())
-    earlier_seconds = float(earlier_run.get("seconds", 0.0))
-    layout_failures = Counter(earlier_run.get("layout_failures", {}))
-    solvable: list[str | None] = earlier_run.get("solvable", [])[:num_files]
+        earlier_run = read_generation_progress(out / PROGRESS_FILE)
+    layout_failures = Counter(earlier_run.layout_failures)
+    solvable = [value and value.value for value in earlier_run.solvable[:num_files]]
     # One less than the files if the run was interrupted between the two writes of a scene.
     num_done = len(solvable)
 
@@ -112,12 +135,12 @@ def generate_scenes(
         write_json(
             out / PROGRESS_FILE,
             {
-                "seconds": earlier_seconds + time.monotonic() - start_time,
+                "seconds": earlier_run.seconds + time.monotonic() - start_time,
                 "layout_failures": dict(layout_failures),
                 "solvable": solvable,
             },
         )
-    seconds = float(json.loads((out / PROGRESS_FILE).read_text())["seconds"])
+    seconds = read_generation_progress(out / PROGRESS_FILE).seconds
 
     files = [load_scene(path, catalog) for path in paths]
     judged = [(file.scene, file.verdict) for file in files if file.verdict is not None]

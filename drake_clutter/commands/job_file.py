@@ -7,7 +7,13 @@ from typing import Any
 
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig, upgrade_header_configs
-from drake_clutter.files import InputError, prepare_output_directory, write_json
+from drake_clutter.files import (
+    InputError,
+    prepare_output_directory,
+    read_json,
+    reading_file,
+    write_json,
+)
 from drake_clutter.validation import to_plain, validate
 
 JOB_FILE = "job.json"
@@ -40,15 +46,15 @@ def open_job_folder(out: Path, job: Mapping[str, Any]) -> None:
 
 def _read_job(path: Path) -> dict[str, Any]:
     """Return a job document with the field names and defaults of this version."""
-    written = json.loads(path.read_text(encoding="utf-8"))
-    job = {_RENAMED_FIELDS.get(key, key): value for key, value in written.items()}
     source = str(path)
-    if "config" in job:
-        job["config"] = to_plain(
-            validate(ClutterConfig, upgrade_header_configs(job["config"]), source)
-        )
-    if "setups" in job:
-        job["setups"] = {
-            name: to_plain(validate(WorkCell, cell, source)) for name, cell in job["setups"].items()
-        }
-    return job
+    content = "the options of a job, unmodified"
+    with reading_file(path, content):
+        written = validate(dict[str, Any], read_json(path, content), source)
+        job = {_RENAMED_FIELDS.get(key, key): value for key, value in written.items()}
+        if "config" in job:
+            config = upgrade_header_configs(job["config"])
+            job["config"] = to_plain(validate(ClutterConfig, config, f"{source}: config"))
+        if "setups" in job:
+            cells = validate(dict[str, WorkCell], job["setups"], f"{source}: setups")
+            job["setups"] = {name: to_plain(cell) for name, cell in cells.items()}
+        return job

@@ -6,12 +6,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from safetensors import SafetensorError, safe_open
+from pydantic import BaseModel, ConfigDict
+from safetensors import safe_open
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from drake_clutter.files import InputError, atomic_write, write_json
+from drake_clutter.files import (
+    atomic_write,
+    input_error,
+    parse_json,
+    read_json,
+    reading_file,
+    write_json,
+)
+from drake_clutter.validation import CountOrZero, validate
+
+_CONTENT = "a checkpoint, .safetensors with a .json beside it"
+"""What a checkpoint may be, for messages."""
 
 
 class RenamedParameters(nn.Module):
@@ -39,10 +51,12 @@ class Checkpoint:
         weights: Weights by name of the parameter.
         metadata: Kind of the network, meaning of its inputs and outputs, configuration, metrics and
             commits of its training.
+        path: File of the weights, for messages.
     """
 
     weights: dict[str, Tensor]
     metadata: dict[str, Any]
+    path: Path
 
 
 def save_checkpoint(path: Path, network: nn.Module, metadata: dict[str, Any]) -> None:
@@ -67,17 +81,44 @@ def load_checkpoint(path: Path) -> Checkpoint:
     Raises:
         InputError: A file is missing or broken.
     """
+    with reading_file(path, _CONTENT):
+        weights = load_file(path)
+    for name, value in weights.items():
+        if not value.isfinite().all():
+            raise input_error(str(path), f"{name}: has weights that are NaN; expected numbers")
+    metadata_path = path.with_suffix(".json")
+    metadata = read_json(metadata_path, _CONTENT)
+    return Checkpoint(weights, validate(dict[str, Any], metadata, str(metadata_path)), path)
+
+
+def load_weights(network: nn.Module, weights: Mapping[str, Tensor], path: Path) -> None:
+    """Load the weights of a checkpoint into a network of its metadata.
+
+    Args:
+        network: The network.
+        weights: Weights by name of the parameter.
+        path: The checkpoint, for the message.
+
+    Raises:
+        InputError: Names or shapes differ.
+    """
     try:
-        return Checkpoint(
-            load_file(path), json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
-        )
-    except (OSError, SafetensorError) as error:
-        raise InputError(
-            f"{path}: cannot be read ({error}); "
-            "expected a checkpoint, .safetensors with a .json beside it"
+        network.load_state_dict(weights)
+    except RuntimeError as error:
+        raise input_error(
+            str(path),
+            f"its weights do not fit {path.with_suffix('.json').name}; "
+            "expected the files of one training",
         ) from error
-    except ValueError as error:
-        raise InputError(f"{path.with_suffix('.json')}: is not JSON ({error})") from error
+
+
+class LearnerState(BaseModel):
+    """What the saved state of every learner has besides its tensors."""
+
+    model_config = ConfigDict(extra="allow")
+
+    step: CountOrZero
+    round: CountOrZero | None = None
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], state: Any) -> None:
@@ -93,11 +134,19 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], state: Any) -> None:
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], Any]:
-    """Return the tensors and the state that `save_tensors` wrote."""
-    with safe_open(path, "pt") as file:
+    """Return the tensors and the state that `save_tensors` wrote.
+
+    Raises:
+        InputError: The file cannot be read, or its state is not a JSON object.
+    """
+    content = "the saved state of a training, unmodified"
+    with reading_file(path, content), safe_open(path, "pt") as file:
         names = file.keys()
         tensors = {name: file.get_tensor(name) for name in names}
-        return tensors, json.loads(file.metadata()["state"])
+        state = parse_json(file.metadata()["state"], f"{path}: state", content, allow_nan=True)
+        return tensors, validate(LearnerState, state, f"{path}: state").model_dump(
+            exclude_unset=True
+        )
 
 
 def _contiguous(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -148,4 +197,20 @@ def restore_learner(
     for key, value in tensors_with_prefix(tensors, "optimizer").items():
         index, _, name = key.partition(".")
         optimizer_state.setdefault(int(index), {})[name] = value
+    _check_optimizer_state(optimizer, optimizer_state)
     optimizer.load_state_dict(optimizer.state_dict() | {"state": optimizer_state})
+
+
+def _check_optimizer_state(optimizer: Optimizer, state: Mapping[int, Mapping[str, Tensor]]) -> None:
+    """Raise a ValueError unless each parameter has the same entries, of its own shape.
+
+    An optimizer without a step has no state.
+    """
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    names = {frozenset(entries) for entries in state.values()}
+    if state and (len(names) != 1 or not state.keys() <= set(range(len(parameters)))):
+        raise ValueError("the entries of the optimizer differ between parameters")
+    for index, entries in state.items():
+        for name, value in entries.items():
+            if value.shape not in ((), parameters[index].shape) or not value.isfinite().all():
+                raise ValueError(f"optimizer.{index}.{name} does not fit its parameter")

@@ -1,12 +1,12 @@
 """Training runs in a folder with configuration, history, curves and resumable state."""
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
+from pydantic import BaseModel, ConfigDict
 from rich.console import Console
 from torch import nn
 from torch.utils.tensorboard import SummaryWriter
@@ -14,13 +14,24 @@ from torch.utils.tensorboard import SummaryWriter
 from drake_clutter.files import (
     InputError,
     file_sha256,
+    input_error,
     prepare_output_directory,
+    read_json,
+    read_text,
+    reading_file,
     write_json,
     write_text,
 )
 from drake_clutter.learning.checkpoint import save_checkpoint
 from drake_clutter.resources import git_commit
-from drake_clutter.validation import config_yaml, to_plain, validate
+from drake_clutter.validation import (
+    CountOrZero,
+    NonEmptyText,
+    NonNegative,
+    config_yaml,
+    to_plain,
+    validate,
+)
 from drake_clutter.yaml_io import read_yaml
 
 CONFIG_FILE = "config.yaml"
@@ -41,6 +52,10 @@ class Learner(Protocol):
     """
 
     step: int
+
+    @property
+    def network(self) -> nn.Module:
+        """The network that it trains."""
 
     def save(self, path: Path) -> None:
         """Write the complete state, from which the training continues as if uninterrupted."""
@@ -95,9 +110,8 @@ class TrainingRun:
             )
         self.history: list[dict[str, Any]] = []
         if (folder / STATE_FILE).exists():
-            learner.load(folder / STATE_FILE)
-            path = folder / HISTORY_FILE
-            rows = json.loads(path.read_text()) if path.exists() else []
+            _load_state(learner, folder / STATE_FILE)
+            rows = _read_history(folder / HISTORY_FILE)
             self.history = [row for row in rows if row["step"] <= learner.step]
         self._console = Console(stderr=True)
         self._writer = SummaryWriter(str(folder / TENSORBOARD_FOLDER), purge_step=learner.step)
@@ -139,6 +153,21 @@ class TrainingRun:
             soft_wrap=True,
         )
 
+    def check_convergence(self) -> None:
+        """Check that the network's weights are numbers, so that they can be trained further.
+
+        Raises:
+            InputError: The training has diverged. The state that was saved last is kept.
+        """
+        if has_diverged(self._learner.network):
+            saved = self._folder / STATE_FILE
+            kept = f"{STATE_FILE} of an earlier step is kept" if saved.exists() else "none is saved"
+            raise input_error(
+                f"--out {self._folder}",
+                f"step {self._learner.step}: weights are NaN, the training diverged; {kept}; "
+                "expected finite weights, try a smaller learning rate",
+            )
+
     def save(self) -> None:
         """Write the learner's state."""
         self._learner.save(self._folder / STATE_FILE)
@@ -166,6 +195,38 @@ class TrainingRun:
         self.save()
 
 
+class _HistoryRow(BaseModel):
+    """What every row of `HISTORY_FILE` has; metrics and losses differ between trainings."""
+
+    model_config = ConfigDict(extra="allow")
+
+    step: CountOrZero
+    seconds: NonNegative
+    commit: NonEmptyText
+
+
+def _read_history(path: Path) -> list[dict[str, Any]]:
+    """Return the rows of a history; an empty list if there is no file."""
+    if not path.exists():
+        return []
+    rows: list[dict[str, Any]] = read_json(path, "the history of a training")
+    validate(list[_HistoryRow], rows, str(path))
+    return rows
+
+
+def _load_state(learner: Learner, path: Path) -> None:
+    """Restore a learner's state."""
+    with reading_file(path, "the saved state of this training, unmodified"):
+        learner.load(path)
+        if has_diverged(learner.network):
+            raise ValueError("has weights that are NaN")
+
+
+def has_diverged(network: nn.Module) -> bool:
+    """Return whether a network has weights that are NaN or infinite."""
+    return not all(bool(weights.isfinite().all()) for weights in network.parameters())
+
+
 def _with_current_names(path: Path, schema: type) -> str:
     """Return the text of a run's `CONFIG_FILE` with the current names of the fields.
 
@@ -176,7 +237,8 @@ def _with_current_names(path: Path, schema: type) -> str:
     Returns:
         The text, or "" if the file holds a configuration of another class.
     """
-    hashes = [line for line in path.read_text().splitlines(keepends=True) if line[0] == "#"]
+    text = read_text(path, "the configuration of a training")
+    hashes = [line for line in text.splitlines(keepends=True) if line[0] == "#"]
     try:
         config: Any = validate(schema, read_yaml(path, "a mapping of config fields"), str(path))
     except InputError:

@@ -15,19 +15,33 @@ The obj_id of a class is its index in the catalog plus 1. Frames: T tray, O obje
 
 import json
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from pydantic import AfterValidator, BaseModel, Field
 
 from drake_clutter.cell.camera import Camera
-from drake_clutter.files import InputError
+from drake_clutter.files import InputError, read_json, reading_file
+from drake_clutter.limits import MAX_IMAGE_SIDE
 from drake_clutter.scenes.scene import Pose
+from drake_clutter.validation import (
+    Count,
+    CountOrZero,
+    Finite,
+    NonEmptyText,
+    Positive,
+    Vector3,
+    allowed_error,
+    validate,
+)
+
+Entry = TypeVar("Entry")
 
 COLOR_FOLDER = "rgb"
 DEPTH_FOLDER = "depth"
@@ -38,6 +52,8 @@ INFO_FILE = "scene_gt_info.json"
 COCO_FILE = "scene_gt_coco.json"
 MAX_INSTANCES = 255
 """Largest number of instances in an image, whose numbers are 0 to 254."""
+_CONTENT = "annotations in the format of BOP"
+"""What the JSON files may contain, for messages."""
 _NO_INSTANCE = 255
 _DEPTH_UNIT = 1e-4
 """Depth of the value 1 in a depth image [m]."""
@@ -236,45 +252,140 @@ class ImageDataset:
                 f"{folder}: holds no images; "
                 "expected a folder that training/render_image_dataset.py wrote"
             )
-        categories = json.loads((scenes[0] / COCO_FILE).read_text(encoding="utf-8"))["categories"]
-        self._class_names = {category["id"]: category["name"] for category in categories}
+        path = scenes[0] / COCO_FILE
+        coco = validate(_CocoFile, read_json(path, "annotations in the format of COCO"), str(path))
+        self._class_names = {category.id: category.name for category in coco.categories}
 
     def __len__(self) -> int:
         return len(self._files)
 
     def __getitem__(self, index: int) -> LabeledImage:
-        """Return the image of an index; the images of one scene have consecutive indices."""
+        """Return the image of an index; the images of one scene have consecutive indices.
+
+        Raises:
+            InputError: A file cannot be read, or does not belong to the others.
+        """
         scene, name = self._files[index]
-        camera_entry, instances, infos = (
-            _read_scene_json(scene / file)[str(int(name))]
-            for file in (CAMERA_FILE, POSES_FILE, INFO_FILE)
-        )
-        color = np.asarray(Image.open(scene / COLOR_FOLDER / f"{name}.png"))
-        stored_depth = np.asarray(Image.open(scene / DEPTH_FOLDER / f"{name}.png"))
-        meters = np.float32(camera_entry["depth_scale"] / 1000)
+        key = name.lstrip("0") or "0"
+        camera_entry = _entry_of_image(_read_cameras, scene / CAMERA_FILE, key)
+        instances = _entry_of_image(_read_poses, scene / POSES_FILE, key)
+        infos = _entry_of_image(_read_infos, scene / INFO_FILE, key)
+        color = _read_png(scene / COLOR_FOLDER / f"{name}.png")
+        stored_depth = _read_png(scene / DEPTH_FOLDER / f"{name}.png")
+        meters = np.float32(camera_entry.depth_scale / 1000)
         depth = stored_depth.astype(np.float32) * meters
         depth[depth == 0] = np.inf
-        label = np.asarray(Image.open(scene / LABEL_FOLDER / f"{name}.png")).astype(np.int64)
+        label = _read_png(scene / LABEL_FOLDER / f"{name}.png").astype(np.int64)
         label[label == _NO_INSTANCE] = -1
+        size = label.shape
+        if len(size) != 2 or depth.shape != size or color.shape != (*size, 3):
+            raise InputError(
+                f"{scene}: image {name}: shapes {color.shape}, {depth.shape}, {label.shape}; "
+                "expected color, depth and label of one size"
+            )
+        if not label.max() < len(instances) == len(infos):
+            raise InputError(
+                f"{scene}: image {name}: {len(instances)} poses, {len(infos)} infos, labels up to "
+                f"{label.max()}; expected one of each for every instance"
+            )
+        unknown = [entry.obj_id for entry in instances if entry.obj_id not in self._class_names]
+        if unknown:
+            raise InputError(
+                f"{scene / POSES_FILE}: {key}: obj_id: {unknown[0]}; "
+                f"expected a category of {COCO_FILE}"
+            )
         return LabeledImage(
             color,
             depth,
             label,
-            tuple(self._class_names[instance["obj_id"]] for instance in instances),
+            tuple(self._class_names[instance.obj_id] for instance in instances),
             tuple(_pose_in_tray(instance, camera_entry) for instance in instances),
-            np.array([info["px_count_all"] for info in infos], np.int64),
+            np.array([info.px_count_all for info in infos], np.int64),
         )
 
 
+def _check_rotation(matrix: tuple[float, ...]) -> tuple[float, ...]:
+    """Check that nine numbers are a rotation matrix, but for rounding."""
+    R = np.reshape(matrix, (3, 3))
+    if not (np.abs(R) < 2).all() or not np.allclose(R @ R.T, np.eye(3), atol=1e-3):
+        raise allowed_error("the nine numbers of a rotation matrix")
+    return matrix
+
+
+_RotationEntry = Annotated[
+    tuple[Finite, ...], Field(min_length=9, max_length=9), AfterValidator(_check_rotation)
+]
+"""Rotation matrix in a file, row by row."""
+
+
+class _CategoryEntry(BaseModel):
+    """A category of `COCO_FILE`."""
+
+    id: Count
+    name: NonEmptyText
+
+
+class _CocoFile(BaseModel):
+    """What is read of `COCO_FILE`."""
+
+    categories: tuple[_CategoryEntry, ...]
+
+
+class _CameraEntry(BaseModel):
+    """What is read of an image's entry in `CAMERA_FILE`."""
+
+    depth_scale: Positive
+    cam_R_w2c: _RotationEntry
+    cam_t_w2c: Vector3
+
+
+class _PoseEntry(BaseModel):
+    """An instance in `POSES_FILE`."""
+
+    obj_id: Count
+    cam_R_m2c: _RotationEntry
+    cam_t_m2c: Vector3
+
+
+class _InfoEntry(BaseModel):
+    """What is read of an instance in `INFO_FILE`."""
+
+    px_count_all: CountOrZero
+
+
 @lru_cache(maxsize=64)
-def _read_scene_json(path: Path) -> dict[str, Any]:
-    document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return document
+def _read_cameras(path: Path) -> dict[str, _CameraEntry]:
+    return validate(dict[str, _CameraEntry], read_json(path, _CONTENT), str(path))
 
 
-def _pose_in_tray(instance: dict[str, Any], camera_entry: dict[str, Any]) -> Pose:
-    R_TC = np.reshape(camera_entry["cam_R_w2c"], (3, 3)).T
-    p_CT = np.array(camera_entry["cam_t_w2c"])
-    R_CO = np.reshape(instance["cam_R_m2c"], (3, 3))
-    p_CO = np.array(instance["cam_t_m2c"])
+@lru_cache(maxsize=64)
+def _read_poses(path: Path) -> dict[str, tuple[_PoseEntry, ...]]:
+    return validate(dict[str, tuple[_PoseEntry, ...]], read_json(path, _CONTENT), str(path))
+
+
+@lru_cache(maxsize=64)
+def _read_infos(path: Path) -> dict[str, tuple[_InfoEntry, ...]]:
+    return validate(dict[str, tuple[_InfoEntry, ...]], read_json(path, _CONTENT), str(path))
+
+
+def _entry_of_image(read: Callable[[Path], Mapping[str, Entry]], path: Path, key: str) -> Entry:
+    """Return the entry of an image in a file of its scene."""
+    entries = read(path)
+    if key not in entries:
+        raise InputError(f"{path}: lacks image {key}; expected one entry for each image")
+    return entries[key]
+
+
+def _read_png(path: Path) -> NDArray[Any]:
+    with reading_file(path, "a PNG image"), Image.open(path) as image:
+        if image.width > MAX_IMAGE_SIDE or image.height > MAX_IMAGE_SIDE:
+            raise ValueError(f"{image.width} x {image.height} pixels")
+        return np.array(image)
+
+
+def _pose_in_tray(instance: _PoseEntry, camera_entry: _CameraEntry) -> Pose:
+    R_TC = np.reshape(camera_entry.cam_R_w2c, (3, 3)).T
+    p_CT = np.array(camera_entry.cam_t_w2c)
+    R_CO = np.reshape(instance.cam_R_m2c, (3, 3))
+    p_CO = np.array(instance.cam_t_m2c)
     return Pose.from_rotation(R_TC @ R_CO, R_TC @ (p_CO - p_CT) / 1000)

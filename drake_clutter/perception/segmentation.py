@@ -12,19 +12,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import BaseModel, Field
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor, nn
 
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.support import Support
 from drake_clutter.compilation import njit
-from drake_clutter.files import InputError
-from drake_clutter.learning.checkpoint import load_checkpoint
+from drake_clutter.files import format_value, input_error
+from drake_clutter.learning.checkpoint import load_checkpoint, load_weights
+from drake_clutter.validation import Flag, NonEmptyText, validate
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
@@ -274,13 +276,22 @@ class SegmentationNetwork(nn.Module):
         metadata = {RENAMED_METADATA.get(key, key): v for key, v in checkpoint.metadata.items()}
         kind = metadata.get("kind")
         if kind != CHECKPOINT_KIND:
-            raise InputError(
-                f"{path}: is a checkpoint of a {kind}; expected one of a {CHECKPOINT_KIND}"
+            raise input_error(
+                str(path),
+                f"is a checkpoint of a {format_value(kind)}; expected one of a {CHECKPOINT_KIND}",
             )
+        validate(_DetectorMetadata, metadata, str(path.with_suffix(".json")))
         network = SegmentationNetwork(metadata["classes"], metadata["use_color"])
         weights = {_current_name(name): value for name, value in checkpoint.weights.items()}
-        network.load_state_dict(weights)
+        load_weights(network, weights, path)
         return network.eval()
+
+
+class _DetectorMetadata(BaseModel):
+    """What a detector needs of the metadata of its checkpoint."""
+
+    classes: Annotated[tuple[NonEmptyText, ...], Field(min_length=1)]
+    use_color: Flag
 
 
 def class_weights(class_maps: Sequence[NDArray[np.int64]], num_classes: int) -> Tensor:

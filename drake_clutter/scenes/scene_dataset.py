@@ -10,21 +10,39 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import AfterValidator, AliasChoices, Field, Strict
 
 from drake_clutter.catalog import Catalog, ObjectClass
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import InputError, write_text
+from drake_clutter.files import (
+    InputError,
+    format_value,
+    input_error,
+    read_json,
+    reading_file,
+    write_text,
+)
 from drake_clutter.grammar import Derivation, SceneGrammar
 from drake_clutter.scenes.layout import LayoutFailure, lay_out
 from drake_clutter.scenes.scene import Pose, Scene
-from drake_clutter.validation import to_plain, validate
+from drake_clutter.validation import (
+    CountOrZero,
+    Finite,
+    NonEmptyText,
+    StrictModel,
+    allowed_error,
+    to_plain,
+    validate,
+)
 
 VERSION = 1
 """Version of the file format."""
+_PoseRow = tuple[Finite, Finite, Finite, Finite, Finite, Finite, Finite]
+"""Translation [m] and quaternion (w, x, y, z) in a file."""
 _LAYOUT_TRIES = 100
 """Layouts sampled for a graph before `relayout` gives up."""
 
@@ -74,9 +92,14 @@ class SceneDataset:
         return SceneGrammar(self.classes)
 
     def derivation(self, index: int, grammar: SceneGrammar) -> Derivation:
-        """Return the graph of a scene, with the rules that derive it."""
+        """Return the graph of a scene, with the rules that derive it.
+
+        Raises:
+            InputError: The rules do not derive a graph.
+        """
         rules = self.scenes[index].rules
-        return Derivation(grammar.replay(rules), rules)
+        with reading_file(f"{self.name}: scenes[{index}].rules", "a derivation of the grammar"):
+            return Derivation(grammar.replay(rules), rules)
 
     def settled_scene(self, index: int, grammar: SceneGrammar, config: ClutterConfig) -> Scene:
         """Return a scene with its settled poses, on the dataset's support.
@@ -93,7 +116,32 @@ class SceneDataset:
         scene = relayout(
             self.derivation(index, grammar), grammar, world, np.random.default_rng(index)
         )
+        if len(poses) != len(scene.names):
+            raise InputError(
+                f"{self.name}: scenes[{index}].settled: {len(poses)} poses; "
+                f"expected {len(scene.names)}, one for each object"
+            )
         return scene.with_poses(dict(zip(scene.names, poses, strict=True)))
+
+
+def _check_quaternion(row: _PoseRow) -> _PoseRow:
+    """Check that the quaternion can be normalized."""
+    if not 1e-6 < np.linalg.norm(row[3:]) < 1e6:
+        raise allowed_error("a pose with a unit quaternion")
+    return row
+
+
+class _SceneEntry(StrictModel):
+    """A scene in the file of a dataset."""
+
+    rules: tuple[CountOrZero, ...]
+    # Version 0.1 calls it a form.
+    canonical_form: Annotated[
+        NonEmptyText, Field(validation_alias=AliasChoices("canonical_form", "form"))
+    ]
+    hidden: CountOrZero
+    solvable: Annotated[str, Strict()] | None
+    settled: tuple[Annotated[_PoseRow, AfterValidator(_check_quaternion)], ...] | None = None
 
 
 def relayout(
@@ -159,23 +207,17 @@ def load_scene_dataset(path: Path, catalog: Catalog) -> SceneDataset:
         InputError: The file cannot be read, has another version, was changed after it was written,
             or needs other object classes.
     """
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+    content = "a scene dataset, which training/generate_scene_dataset.py wrote"
+    with reading_file(path, content):
+        document = validate(dict[str, Any], read_json(path, content), str(path))
         entries = document.pop("scenes")
         digest = document.pop("sha256")
         was_changed = _digest(document, entries) != digest
         version = document.pop("version")
         names = document.pop("rules")
         objects = document["objects"]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"{path}: is not a scene dataset ({error}); "
-            "expected a file that training/generate_scene_dataset.py wrote"
-        ) from error
     if version != VERSION:
-        raise InputError(f"{path}: version: {version}; expected {VERSION}")
+        raise input_error(str(path), f"version: {format_value(version)}; expected {VERSION}")
     if was_changed:
         raise InputError(
             f"{path}: sha256: does not match the scenes, which were changed; "
@@ -184,15 +226,21 @@ def load_scene_dataset(path: Path, catalog: Catalog) -> SceneDataset:
     # A dataset of version 0.1 has no cell.
     given = document.pop("cell", None)
     cell = default_cell() if given is None else validate(WorkCell, given, f"{path}: cell")
+    names = validate(tuple[NonEmptyText, ...], names, f"{path}: rules")
+    objects = validate(NonEmptyText, objects, f"{path}: objects")
     scenes = []
-    for entry in entries:
-        poses = (
-            tuple(_pose(numbers) for numbers in entry["settled"]) if "settled" in entry else None
+    for number, entry in enumerate(validate(tuple[_SceneEntry, ...], entries, f"{path}: scenes")):
+        unknown = [k for k in entry.rules if k >= len(names)]
+        if unknown:
+            raise InputError(
+                f"{path}: scenes[{number}].rules: {unknown[0]}; expected the number of a rule, "
+                f"below {len(names)}"
+            )
+        poses = None if entry.settled is None else tuple(map(_pose, entry.settled))
+        rules = tuple(names[k] for k in entry.rules)
+        scenes.append(
+            SceneRecord(rules, entry.canonical_form, entry.hidden, entry.solvable or "", poses)
         )
-        rules = tuple(names[k] for k in entry["rules"])
-        # Version 0.1 calls it a form.
-        form = entry["canonical_form"] if "canonical_form" in entry else entry["form"]
-        scenes.append(SceneRecord(rules, form, entry["hidden"], entry["solvable"], poses))
     return SceneDataset(
         path.name, catalog.object_set(objects), document, tuple(scenes), digest, cell
     )

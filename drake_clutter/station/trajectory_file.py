@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 from drake_clutter.catalog import Catalog
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.config import upgrade_cell
-from drake_clutter.files import InputError, atomic_write, input_error
+from drake_clutter.files import InputError, atomic_write, format_value, input_error, reading_file
+from drake_clutter.limits import MAX_SAMPLES
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.interfaces import ArmState, MotionSample, Move, Outcome
 from drake_clutter.scenes.scene import Pose, Scene
@@ -111,16 +112,11 @@ def read_trajectories(
     Raises:
         InputError: The file is not a trajectory file; names the field and what is allowed.
     """
-    try:
-        file = h5py.File(path)
-    except OSError as error:
-        raise input_error(
-            str(path), f"cannot be read as HDF5; expected a trajectory file ({error})"
-        ) from error
-    with file:
-        if int(file.attrs.get("version", 0)) != FORMAT_VERSION or "scene" not in file.attrs:
-            found = f"{path}: version {file.attrs.get('version')}"
-            raise InputError(f"{found}; expected a trajectory file of version {FORMAT_VERSION}")
+    content = f"a trajectory file of version {FORMAT_VERSION} (HDF5)"
+    with reading_file(path, content), h5py.File(path) as file:
+        version = file.attrs.get("version")
+        if version != FORMAT_VERSION or "scene" not in file.attrs:
+            raise input_error(str(path), f"version {format_value(version)}; expected {content}")
         scene = scene_from_yaml(str(file.attrs["scene"]), f"{path}:scene", catalog).scene
         cell = _read_cell(path, file.attrs).with_support(scene.support)
         num_joints = load_robot(cell.robot).num_joints
@@ -151,9 +147,17 @@ def _read_move(
             not isinstance(dataset, h5py.Dataset)
             or len(dataset.shape) == 0
             or dataset.shape[1:] != shape
+            or dataset.shape[0] > MAX_SAMPLES
         ):
-            raise InputError(f"{path}:{name}.{field}; expected a dataset of shape {('n', *shape)}")
+            raise InputError(
+                f"{path}:{name}.{field}; expected a dataset of shape {('n', *shape)}, "
+                f"n at most {MAX_SAMPLES}"
+            )
         arrays[field] = dataset[()]
+        if arrays[field].dtype.kind not in "bif" or not np.isfinite(arrays[field]).all():
+            raise InputError(f"{path}:{name}.{field}; expected finite numbers")
+    if not (np.abs(np.linalg.norm(arrays["X_TO"][..., :4], axis=-1) - 1) < 0.01).all():
+        raise InputError(f"{path}:{name}.X_TO; expected unit quaternions")
     lengths = {field: len(values) for field, values in arrays.items()}
     if len(set(lengths.values())) != 1:
         raise InputError(f"{path}:{name}: lengths {lengths}; expected equal lengths")
