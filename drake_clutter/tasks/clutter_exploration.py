@@ -5,16 +5,24 @@ from typing import Any, SupportsFloat
 
 import gymnasium
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import InputError
+from drake_clutter.files import InputError, format_value
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.interfaces import Move, MoveResult
 from drake_clutter.scenes.scene import TRAY, Scene, SceneObject
 from drake_clutter.scenes.scene_dataset import SceneDataset, load_scene_dataset, relayout
 from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.tasks.belief import Decision
+from drake_clutter.tasks.environment_interface import (
+    RENDER_METADATA,
+    check_index,
+    check_render_mode,
+    check_reset_options,
+    render_picture,
+)
 from drake_clutter.tasks.episode import BackendFactory, make_teleport_backend_factory
 from drake_clutter.tasks.exploration_graph import (
     EDGE_KINDS,
@@ -42,8 +50,9 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
     of K_t (the objects that have been in view) or, if privileged, of all objects. Node 0 is the
     tray. Nodes keep their indices during an episode.
 
-    Action space: `MultiDiscrete([N, N])`, the nodes x and y of a move of x onto y. `action_mask` of
-    the observation marks the allowed moves; any other changes nothing, but counts as a move.
+    Action space: `MultiDiscrete([N, N])`, the nodes x and y of a move of x onto y; with
+    `flat_actions`, `Discrete(N * N)`, the number x * N + y. `action_mask` of the observation marks
+    the allowed moves; any other changes nothing, but counts as a move.
 
     Reward: `detection_reward` per newly detected object; `collapse_penalty` if the scene collapses.
 
@@ -54,7 +63,7 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
     end of an episode the `termination` (a `TerminationReason`).
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012, gymnasium's name
+    metadata: dict[str, Any] = RENDER_METADATA
 
     def __init__(
         self,
@@ -65,6 +74,8 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
         max_moves: int | None = None,
         max_objects: int = 24,
         config: ClutterConfig | None = None,
+        flat_actions: bool = False,
+        render_mode: str | None = None,
     ) -> None:
         """Create an environment.
 
@@ -76,7 +87,13 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
             max_objects: Maximum number of objects of a scene.
             config: Configuration of the simulated world; None selects the default with the
                 dataset's work cell.
+            flat_actions: Whether an action is the number x * N + y instead of the pair (x, y).
+            render_mode: "rgb_array" for pictures, or None.
+
+        Raises:
+            InputError: There is no such file, fidelity or render mode.
         """
+        self.render_mode = check_render_mode(render_mode)
         if not isinstance(scenes, SceneDataset):
             path = resource_path(DEFAULT_SCENES) if scenes is None else Path(scenes)
             scenes = load_scene_dataset(path, load_catalog())
@@ -105,7 +122,12 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
             "action_mask": box(0, 1, (n, n), np.int8),
         }
         self.observation_space = gymnasium.spaces.Dict(spaces)  # type: ignore[assignment]
-        self.action_space: gymnasium.Space[Any] = gymnasium.spaces.MultiDiscrete([n, n])
+        self._flat_actions = flat_actions
+        self.action_space: gymnasium.Space[Any] = (
+            gymnasium.spaces.Discrete(n * n)
+            if flat_actions
+            else gymnasium.spaces.MultiDiscrete([n, n])
+        )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -116,12 +138,13 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
             InputError: The dataset has no scene of the given index, or no suitable scene was found.
         """
         super().reset(seed=seed)
-        index = None if options is None else options.get("scene")
+        index = check_reset_options(options, ("scene",)).get("scene")
         if index is None:
             return self._reset_to_random_scene(), {}
-        if not 0 <= index < len(self.scenes.scenes):
+        is_integer = isinstance(index, int | np.integer) and not isinstance(index, bool)
+        if not is_integer or not 0 <= index < len(self.scenes.scenes):
             raise InputError(
-                f"scene: {index}; expected 0 to {len(self.scenes.scenes) - 1}, "
+                f"scene: {format_value(index)}; expected 0 to {len(self.scenes.scenes) - 1}, "
                 f"as {self.scenes.name} has them"
             )
         scene = self.scenes.settled_scene(index, self.grammar, self._config)
@@ -205,11 +228,41 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
             max_nodes=self._max_nodes,
         )
 
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Return which actions are allowed, as sb3-contrib asks for it.
+
+        Returns:
+            With flat actions, the mask of the pairs. Shape (N * N,). Otherwise the masks of x and
+            y, which sb3-contrib samples independently: nodes that are part of an allowed pair, so
+            that some of their pairs are not allowed. Shape (2 * N,).
+        """
+        mask = self._action_mask.astype(bool)
+        return mask.ravel() if self._flat_actions else np.concatenate([mask.any(1), mask.any(0)])
+
+    def render(self) -> Any:
+        """Return the camera's picture as (height, width, 3) uint8; None without a render mode."""
+        return (
+            None if self.render_mode is None else render_picture(self.backend.scene, self._config)
+        )
+
+    def _node_pair(self, action: Any) -> tuple[int, int]:
+        """Return the nodes x and y of an action."""
+        n = self._max_nodes
+        if self._flat_actions:
+            return divmod(check_index(action, n * n, "action"), n)
+        if np.shape(action) != (2,):
+            raise InputError(f"action: {format_value(action)}; expected two nodes, x and y")
+        return check_index(action[0], n, "action[0]"), check_index(action[1], n, "action[1]")
+
     def step(
         self, action: Any
     ) -> tuple[ExplorationObservation, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Carry out a move; a masked move changes nothing, but counts as a move."""
-        x, y = (int(v) for v in action)
+        """Carry out a move; a masked move changes nothing, but counts as a move.
+
+        Raises:
+            InputError: There is no such action.
+        """
+        x, y = self._node_pair(action)
         names = self.objects
         if not self._action_mask[x, y]:
             self._num_masked_moves += 1

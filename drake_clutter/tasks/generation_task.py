@@ -29,6 +29,13 @@ from drake_clutter.scenes.interfaces import InconclusiveVerdict, Verdict
 from drake_clutter.scenes.layout import LayoutFailure, Stack, lay_out
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.stability.static_judge import StaticStabilityJudge
+from drake_clutter.tasks.environment_interface import (
+    RENDER_METADATA,
+    check_index,
+    check_render_mode,
+    check_reset_options,
+    render_picture,
+)
 from drake_clutter.validation import (
     Flag,
     InRange,
@@ -40,6 +47,11 @@ from drake_clutter.validation import (
 
 MAX_BALANCED_STACK_FRACTION = 0.6
 """Largest fraction of a balanced scene's objects that may be in one stack."""
+MAX_INFEASIBLE_ACTIONS_PER_NODE = 100
+"""Number of infeasible actions per node of a graph after which an episode is truncated.
+
+An agent that samples rules uniformly needs about 10 attempts for each rule that it applies.
+"""
 _REMAINING_NODES_SCALE = 25
 """Number of remaining nodes that is represented by 1: the size of the largest trained graphs."""
 
@@ -123,6 +135,7 @@ class PartialScene:
             stands at the center of the tray [m]. Shape (3,) each.
         num_hidden: Number of objects that are hidden by their own stack.
         failure: Why the latest finished stack ends the derivation; None if it does not.
+        latest_stack: The latest finished stack at the center of the tray, or None.
         action_mask: Which rules are feasible. Shape (number of rules,).
     """
 
@@ -154,6 +167,7 @@ class PartialScene:
         self.object_positions: dict[int, NDArray[np.float64]] = {}
         self.num_hidden = 0
         self.failure: StackFailure | None = None
+        self.latest_stack: Scene | None = None
         self._match_rules()
 
     def _match_rules(self) -> None:
@@ -220,6 +234,7 @@ class PartialScene:
         """Record the positions, and the failure or the hidden objects of a finished stack."""
         self.object_positions |= dict(zip(stack.nodes, stack.p_T, strict=True))
         scene = Scene(tuple(stack.objects()), self._config.cell.support)
+        self.latest_stack = scene
         if stack.upper[2] > self._config.layout.max_stack_height:
             self.failure = StackFailure.TOO_HIGH
             return
@@ -317,7 +332,7 @@ class ClutterGeneration(gymnasium.Env[GenerationObservation, int]):
     - `remaining_nodes` (1,): Number of nodes that are still to be added, divided by 25.
 
     Action space: `Discrete`, the rules of the grammar. `info["action_mask"]` (number of rules,)
-    marks the feasible ones; any other changes nothing.
+    marks the feasible ones, as does `action_masks`; any other changes nothing.
 
     Reward: `hidden_reward` for each object that a stack hides, when the stack is finished and
     stable. An unstable stack ends the episode: the earlier rewards are taken back, and
@@ -330,15 +345,22 @@ class ClutterGeneration(gymnasium.Env[GenerationObservation, int]):
     Termination: no rule is feasible, or a stack has failed. The last `info` has the `scene` and its
     `verdict`, or the `failure`: a `StackFailure`, or None if the finished scene could not be laid
     out or was not stable.
+
+    Truncation: after `MAX_INFEASIBLE_ACTIONS_PER_NODE` infeasible actions per node, so that
+    episodes of agents that ignore the mask end.
+
+    Rendering: the picture of the work cell's first camera, of the latest finished stack, and at the
+    end of the finished scene.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012, gymnasium's name
+    metadata: dict[str, Any] = RENDER_METADATA
 
     def __init__(
         self,
         classes: Sequence[ObjectClass] | None = None,
         task: GenerationTaskConfig | None = None,
         config: ClutterConfig | None = None,
+        render_mode: str | None = None,
     ) -> None:
         """Create an environment.
 
@@ -346,7 +368,12 @@ class ClutterGeneration(gymnasium.Env[GenerationObservation, int]):
             classes: Object classes of the grammar; None selects the seven YCB objects.
             task: Requirements and rewards; None selects the defaults.
             config: Configuration of the simulated world; None selects the default.
+            render_mode: "rgb_array" for pictures, or None.
+
+        Raises:
+            InputError: There is no such render mode.
         """
+        self.render_mode = check_render_mode(render_mode)
         self.task = task or GenerationTaskConfig()
         self._config = config or ClutterConfig()
         self.grammar = SceneGrammar(classes or load_catalog().object_set("ycb7"))
@@ -372,10 +399,25 @@ class ClutterGeneration(gymnasium.Env[GenerationObservation, int]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[GenerationObservation, dict[str, Any]]:
-        """Start an episode from the tray."""
+        """Start an episode from the tray.
+
+        Raises:
+            InputError: There are options, of which this environment has none.
+        """
         super().reset(seed=seed)
+        check_reset_options(options, ())
+        self._num_infeasible = 0
+        self._scene = Scene((), self._config.cell.support)
         self.partial = PartialScene(self.grammar, self.task, self._config, self._judge)
         return self.partial.observe(), self._info()
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Return which rules are feasible, as sb3-contrib asks for it. Shape (number of rules,)."""
+        return self.partial.action_mask.astype(bool)
+
+    def render(self) -> Any:
+        """Return the camera's picture as (height, width, 3) uint8; None without a render mode."""
+        return None if self.render_mode is None else render_picture(self._scene, self._config)
 
     def _info(self) -> dict[str, Any]:
         return {"action_mask": self.partial.action_mask.astype(np.int8)}
@@ -383,14 +425,24 @@ class ClutterGeneration(gymnasium.Env[GenerationObservation, int]):
     def step(
         self, action: int
     ) -> tuple[GenerationObservation, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Apply a rule, given by its index."""
+        """Apply a rule, given by its index.
+
+        Raises:
+            InputError: There is no such action.
+        """
+        action = check_index(action, len(self.grammar.rules), "action")
         partial = self.partial
         if not partial.action_mask[action]:
-            return partial.observe(), 0.0, partial.finished, False, self._info()
+            self._num_infeasible += 1
+            limit = MAX_INFEASIBLE_ACTIONS_PER_NODE * self.task.nodes
+            truncated = self._num_infeasible >= limit
+            return partial.observe(), 0.0, partial.finished, truncated, self._info()
         return_before = self.task.hidden_reward * partial.num_hidden
-        partial.apply(int(action))
+        partial.apply(action)
         info = self._info()
         return_after = self.task.hidden_reward * partial.num_hidden
+        if partial.latest_stack is not None:
+            self._scene = partial.latest_stack
         terminated = partial.finished or partial.failure is not None
         if terminated:
             finished_scene = None
@@ -401,5 +453,6 @@ class ClutterGeneration(gymnasium.Env[GenerationObservation, int]):
                 return_after = self.task.instability_reward
             else:
                 info["scene"], info["verdict"] = finished_scene
+                self._scene = info["scene"]
                 return_after = partial.terminal_reward(len(info["verdict"].hidden))
         return partial.observe(), return_after - return_before, terminated, False, info

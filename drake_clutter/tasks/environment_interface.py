@@ -1,0 +1,84 @@
+"""What both gymnasium environments share: pictures, and checks of actions and options."""
+
+import operator
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_clutter.config import ClutterConfig
+from drake_clutter.files import InputError, format_value
+from drake_clutter.scenes.scene import Scene
+
+RENDER_METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 1}
+"""Metadata of the environments for gymnasium: render modes, and pictures per second of a video."""
+
+
+def check_render_mode(render_mode: str | None) -> str | None:
+    """Return a render mode.
+
+    Raises:
+        InputError: The environments do not have the mode.
+    """
+    if render_mode not in (None, *RENDER_METADATA["render_modes"]):
+        raise InputError(f"render_mode: {format_value(render_mode)}; expected 'rgb_array' or None")
+    return render_mode
+
+
+def check_reset_options(
+    options: Mapping[str, Any] | None, names: Collection[str]
+) -> Mapping[str, Any]:
+    """Return the options of a reset.
+
+    Args:
+        options: The options, or None.
+        names: Names of the options that there are.
+
+    Raises:
+        InputError: Another option is given.
+    """
+    if options is None:
+        return {}
+    expected = ", ".join(map(repr, names)) or "none"
+    if not isinstance(options, Mapping):
+        raise InputError(f"options: {format_value(options)}; expected a dict with {expected}")
+    for name in options:
+        if name not in names:
+            raise InputError(f"options: {format_value(name)}; expected {expected}")
+    return options
+
+
+def check_index(value: Any, count: int, name: str) -> int:
+    """Return an integer in [0, count).
+
+    Args:
+        value: An integer, or an array with one integer.
+        count: Number of allowed integers.
+        name: What the value is, for the message.
+
+    Raises:
+        InputError: The value is not such an integer.
+    """
+    try:
+        index = operator.index(value.item() if np.shape(value) in ((), (1,)) else value)
+    except AttributeError:  # an integer of Python
+        index = value
+    except TypeError:
+        index = -1
+    if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < count:
+        raise InputError(f"{name}: {format_value(value)}; expected an integer in [0, {count - 1}]")
+    return index
+
+
+def render_picture(scene: Scene, config: ClutterConfig) -> NDArray[np.uint8]:
+    """Return the color image of a scene. Shape (height, width, 3).
+
+    Args:
+        scene: The scene.
+        config: The simulated world, with the camera.
+    """
+    # Drake's rendering is imported when it is needed, because trainings do not.
+    from drake_clutter.simulation.camera_renderer import CameraRenderer
+
+    return CameraRenderer(config.cell.camera).render(scene).color
