@@ -1,6 +1,6 @@
 """Time stability verdicts, visibility and search, beside PyBullet on the same scenes and core.
 
-python benchmarks/judge_speed.py --out judge_speed.json --figure growth.png
+python benchmarks/judge_speed.py --out judge_speed.json
 """
 
 import os
@@ -19,7 +19,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pybullet
 import typer
@@ -502,36 +501,6 @@ def show_results(results: Row, console: Console) -> None:
     console.print(make_table("headline", targets, {"target": "target", "measured": "measured"}))
 
 
-def draw_growth(growth: Sequence[Row], path: Path) -> None:
-    """Plot the time of judges and cameras over the number of objects."""
-    plt.rcParams.update({"font.size": 20, "lines.linewidth": 3, "lines.markersize": 11})
-    objects = [row["objects"] for row in growth]
-    figure, panels = plt.subplots(1, 2, figsize=(15, 7.5), layout="constrained", sharey=True)
-    parts = (
-        ("judges", (BULLET, DRAKE, STATIC_COLD), "verdict"),
-        ("eyes", (BULLET_LABELS, VTK_LABELS, RAY_LABELS), "frame"),
-    )
-    for panel, (part, names, unit) in zip(panels, parts, strict=True):
-        for name, marker in zip(names, "sDo", strict=True):
-            means = [row[part][name]["mean_ms"] for row in growth]
-            panel.loglog(objects, means, marker=marker, label=name)
-        panel.set_xticks(objects, objects)
-        panel.minorticks_off()
-        panel.set(xlabel="objects in the scene", ylabel=f"mean ms per {unit}")
-        panel.tick_params(labelleft=True)
-        panel.grid(alpha=0.4)
-        panel.legend(
-            loc="lower right",
-            bbox_to_anchor=(1, 1),
-            ncols=3,
-            columnspacing=0.8,
-            handletextpad=0.3,
-            fontsize=16,
-        )
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
-
-
 def headline_numbers(results: Row) -> dict[str, float]:
     """Return the numbers that have `TARGETS`."""
     (sixteen,) = (row["judges"][STATIC_COLD] for row in results["growth"] if row["objects"] == 16)
@@ -555,10 +524,6 @@ def main(
     ] = 60,
     seed: SeedOption = 0,
     out: ResultsOption = None,
-    figure: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Plot of the time over the number of objects (PNG)."),
-    ] = None,
 ) -> None:
     """Measure all judges, cameras and the search; print and write the results."""
     # PyBullet prints to the standard output of the process: keep it for the tables alone.
@@ -566,8 +531,8 @@ def main(
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     if hasattr(os, "sched_setaffinity"):  # Renderers start threads.
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    for path in filter(None, (out, figure)):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
     start = time.monotonic()
     static = StaticStabilityJudge(CONFIG)
     accurate_settle = replace(CONFIG.settle, early_stop_samples=NEVER)
@@ -595,8 +560,6 @@ def main(
     results["seconds"] = time.monotonic() - start
     if out is not None:
         write_json(out, results)
-    if figure is not None:
-        draw_growth(results["growth"], figure)
     show_results(results, console)
 
 

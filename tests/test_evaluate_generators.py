@@ -39,19 +39,3 @@ def test_a_table_of_one_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert out.stat().st_mtime_ns == before, "a complete row is not measured again"
     with pytest.raises(InputError, match="holds results of another seed"):
         script.main(tmp_path / "scenes", seed=4, out=out)
-
-
-def test_the_plot_of_the_temperature_effect(tmp_path: Path) -> None:
-    metrics = {
-        "hidden_mean": 5.0,
-        "hidden_ci95": (4.0, 6.0),
-        "stability_rate": 0.9,
-        "solvable_share": 0.8,
-        "distinct_share": 1.0,
-    }
-    metrics |= {"balanced_share": 0.5, "class_entropy": 2.0, "objects": "ycb7"}
-    script.draw_temperature_effect(
-        [{"temperature": 0.1} | metrics, {"temperature": 0.4} | metrics],
-        tmp_path / "temperature.png",
-    )
-    assert (tmp_path / "temperature.png").stat().st_size > 10_000

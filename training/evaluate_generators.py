@@ -5,25 +5,18 @@
 The scenes stay in the folder. An interrupted run is resumed by the same command.
 """
 
-import json
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-import numpy as np
 import typer
 
-from drake_clutter.agents.generators import PRETRAINED_GENERATORS, GenerationJob
+from drake_clutter.agents.generators import GenerationJob
 from drake_clutter.catalog import load_catalog
 from drake_clutter.commands.generate_scenes import SCENES_FOLDER, generate_scenes
 from drake_clutter.config import ClutterConfig
-from drake_clutter.resources import resource_path
 from drake_clutter.scenes.interfaces import InconclusiveVerdict, Instability
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.stability.static_judge import StaticStabilityJudge
@@ -170,67 +163,6 @@ def table_row(row: Row) -> dict[str, str]:
     } | {title: format_number(row[key], 3) for title, key in columns.items()}
 
 
-def temperature_rows(results: ResultsFile) -> list[Row]:
-    """Return the rows of SG* at 25 nodes in the order of their temperatures.
-
-    The row of Table I is one of them, with the temperature that is stored in the checkpoint.
-    """
-    rows = [row for e in TEMPERATURES if (row := results.find(asdict(e))) is not None]
-    if (default := results.find(asdict(GeneratorEvaluation("sg-star", 25, 0)))) is not None:
-        checkpoint = resource_path(PRETRAINED_GENERATORS["sg-star"]).with_suffix(".json")
-        rows.append(default | {"temperature": json.loads(checkpoint.read_text())["temperature"]})
-    return sorted(rows, key=lambda row: float(row["temperature"]))
-
-
-def draw_temperature_effect(rows: Sequence[Row], path: Path) -> None:
-    """Plot hidden objects, stability and diversity over the temperature.
-
-    Args:
-        rows: See `temperature_rows`.
-        path: Image file to write.
-    """
-    plt.rcParams.update({"font.size": 20, "lines.linewidth": 3, "lines.markersize": 11})
-    figure, (left, right) = plt.subplots(1, 2, figsize=(15, 6.5), layout="constrained")
-    temperatures = [row["temperature"] for row in rows]
-    hidden = np.array(
-        [[row["hidden_mean"], *(row["hidden_ci95"] or (np.nan, np.nan))] for row in rows]
-    )
-    left.errorbar(
-        temperatures, hidden[:, 0], np.abs(hidden[:, 1:] - hidden[:, :1]).T, marker="o", capsize=6
-    )
-    left.set(
-        xscale="log",
-        xlabel="temperature of the policy",
-        ylabel="hidden objects in a stable scene",
-        ylim=(0, None),
-    )
-    for key, name, marker in (
-        ("stability_rate", "stable", "o"),
-        ("solvable_share", "solvable", "s"),
-        ("distinct_share", "distinct", "D"),
-        ("balanced_share", "balanced", "^"),
-    ):
-        right.plot(temperatures, [row[key] for row in rows], marker=marker, label=name)
-    relative_entropy = [
-        row["class_entropy"] / np.log2(len(load_catalog().object_set(row["objects"])))
-        for row in rows
-    ]
-    right.plot(temperatures, relative_entropy, marker="v", label="class entropy,\nrelative")
-    right.set(
-        xscale="log",
-        xlabel="temperature of the policy",
-        ylabel="fraction of the scenes",
-        ylim=(0, 1.03),
-    )
-    right.legend(loc="lower right", fontsize=16)
-    for panel in (left, right):
-        panel.grid(alpha=0.4)
-        panel.set_xticks(temperatures, [f"{value:g}" for value in temperatures], rotation=45)
-        panel.minorticks_off()
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
-
-
 def main(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder for the scenes.")],
     workers: WorkersOption = 1,
@@ -245,9 +177,6 @@ def main(
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="Results file to write (JSON).")
     ] = RESULTS / "table1.json",
-    figure: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Plot of the temperature's effect (PNG).")
-    ] = None,
 ) -> None:
     """Evaluate the generators, as far as it has not been done, and print the table."""
     results = ResultsFile(out, {"seed": seed}, ("agent", "objects", "nodes", "temperature"))
@@ -260,8 +189,6 @@ def main(
         part = replace(evaluation, count=count)
         results.add(evaluate_generator(part, folder / evaluation.name, workers, seed))
     print_table([table_row(row) for row in results.read()])
-    if figure is not None:
-        draw_temperature_effect(temperature_rows(results), figure)
 
 
 if __name__ == "__main__":
