@@ -54,12 +54,12 @@ def evaluate_size(
     row = summarize_scenes(job, [(scene.scene, scene.verdict) for scene in scenes])
     fractions = [s.verdict.visible_fractions.values() for s in scenes if s.verdict.stable]
     failures = sum((s.layout_failures for s in scenes), start=type(scenes[0].layout_failures)())
+    hidden_by_threshold: dict[str, float | None] = {}
+    for threshold in THRESHOLDS:
+        num_hidden = sum(f < threshold for scene in fractions for f in scene)
+        hidden_by_threshold[str(threshold)] = num_hidden / len(fractions) if fractions else None
     return row | {
-        "hidden_by_threshold": {
-            str(threshold): sum(f < threshold for scene in fractions for f in scene)
-            / len(fractions)
-            for threshold in THRESHOLDS
-        },
+        "hidden_by_threshold": hidden_by_threshold,
         "layout_failures": dict(failures),
         "seconds": time.monotonic() - start,
         **provenance(),

@@ -80,8 +80,8 @@ def progress(
 
 
 def format_number(value: float | None, digits: int = 2) -> str:
-    """Return a number with a fixed number of decimals; "" for None."""
-    return "" if value is None else f"{value:.{digits}f}"
+    """Return a number with a fixed number of decimals; a dash for None."""
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def print_table(rows: Sequence[Mapping[str, Any]], title: str | None = None) -> None:
