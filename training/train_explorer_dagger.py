@@ -11,16 +11,17 @@ from dataclasses import field
 from pathlib import Path
 
 from drake_clutter.agents.behavior_cloning import BehaviorCloningConfig, BehaviorCloningLearner
-from drake_clutter.agents.explorer_training import CHECKPOINT_FILE, ExplorerTrainingConfig
-from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, explorer_metadata, load_explorer
+from drake_clutter.agents.explorer_training import ExplorerTrainingConfig
+from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, load_explorer
 from drake_clutter.agents.message_passing import limit_operations_to_one_thread
 from drake_clutter.config import upgrade_config
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import load_checkpoint
-from drake_clutter.learning.training_run import TrainingRun, resolve_device
+from drake_clutter.learning.training_run import resolve_device
 from drake_clutter.validation import Count, config_class, load_config_as
+from training.explorer_loop import train_explorer
 from training.script import ConfigOption, SettingsOption, run_script
-from training.training_loop import DeviceOption, Metrics, OutOption, train_to_end
+from training.training_loop import DeviceOption, OutOption
 
 
 @config_class
@@ -63,24 +64,16 @@ def main(
     learner = BehaviorCloningLearner(
         environment, teacher.to(torch_device), training.learning, training.seed, torch_device
     )
-    run = TrainingRun(
-        out, training, learner, training.learning.iterations, [Path(training.scenes), path]
-    )
-
-    def evaluate() -> tuple[Metrics, Metrics]:
-        return training.evaluate(environment, learner.network), learner.losses
-
-    train_to_end(
-        run,
+    train_explorer(
+        out,
+        training,
+        environment,
         learner,
-        training.learning.iterations,
-        train_iteration=learner.train_iteration,
-        evaluate=evaluate,
+        kind=STUDENT,
+        total_steps=training.learning.iterations,
         evaluate_every=training.evaluate_every,
-        save_every=training.evaluate_every,
+        input_files=[Path(training.scenes), path],
     )
-    network_metadata = explorer_metadata(environment.node_kind_ids, training.learning.width)
-    run.finish(CHECKPOINT_FILE, learner.network, {"kind": STUDENT, "network": network_metadata})
 
 
 if __name__ == "__main__":

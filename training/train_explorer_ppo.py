@@ -10,17 +10,18 @@ uninterrupted one.
 from dataclasses import field
 from pathlib import Path
 
-from drake_clutter.agents.explorer_training import CHECKPOINT_FILE, ExplorerTrainingConfig
-from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, explorer_metadata, load_explorer
+from drake_clutter.agents.explorer_training import ExplorerTrainingConfig
+from drake_clutter.agents.learned_explorer import STUDENT, TEACHER, load_explorer
 from drake_clutter.agents.message_passing import limit_operations_to_one_thread
 from drake_clutter.agents.ppo import PPOConfig, PPOLearner
 from drake_clutter.config import upgrade_config
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import load_checkpoint
-from drake_clutter.learning.training_run import TrainingRun, resolve_device
+from drake_clutter.learning.training_run import resolve_device
 from drake_clutter.validation import Count, Flag, config_class, load_config_as
+from training.explorer_loop import train_explorer
 from training.script import ConfigOption, SettingsOption, run_script
-from training.training_loop import DeviceOption, Metrics, OutOption, train_to_end
+from training.training_loop import DeviceOption, OutOption
 
 
 @config_class
@@ -70,23 +71,16 @@ def main(
                 " checkpoint with the same"
             )
         learner.network.load_state_dict(network.state_dict())
-    input_files = [Path(file) for file in (training.scenes, training.warm_start) if file]
-    run = TrainingRun(out, training, learner, training.learning.total_timesteps, input_files)
-
-    def evaluate() -> tuple[Metrics, Metrics]:
-        return training.evaluate(environment, learner.network), learner.losses
-
-    train_to_end(
-        run,
+    train_explorer(
+        out,
+        training,
+        environment,
         learner,
-        training.learning.total_timesteps,
-        train_iteration=learner.train_iteration,
-        evaluate=evaluate,
+        kind=kind,
+        total_steps=training.learning.total_timesteps,
         evaluate_every=training.evaluate_every,
-        save_every=training.evaluate_every,
+        input_files=[Path(file) for file in (training.scenes, training.warm_start) if file],
     )
-    network_metadata = explorer_metadata(environment.node_kind_ids, training.learning.width)
-    run.finish(CHECKPOINT_FILE, learner.network, {"kind": kind, "network": network_metadata})
 
 
 if __name__ == "__main__":
