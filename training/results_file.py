@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import drake_clutter
-from drake_clutter.config import upgrade_header_configs
+from drake_clutter.config import ClutterConfig, upgrade_config, upgrade_header_configs
 from drake_clutter.files import (
     InputError,
     format_value,
@@ -25,8 +25,9 @@ from drake_clutter.files import (
 from drake_clutter.records import resume_jsonl
 from drake_clutter.resources import git_commit
 from drake_clutter.tasks.episode import current_fidelity
-from drake_clutter.validation import validate
+from drake_clutter.validation import override_config, to_plain, validate
 from drake_clutter.workers.parallel_map import map_ordered
+from drake_clutter.yaml_io import parse_yaml
 from training.script import progress
 
 Row = dict[str, Any]
@@ -39,10 +40,20 @@ def provenance() -> dict[str, str]:
 
 
 def upgrade_record_header(header: Any) -> Any:
-    """Upgrade the header of a file of an earlier version to the current names of fields."""
+    """Upgrade the header of a file of an earlier version to the current names of fields.
+
+    A config that is written as YAML text is complete for its version. Fields that have been added
+    to it since have their default values.
+    """
     upgraded = upgrade_header_configs(header)
-    if isinstance(upgraded, dict) and "fidelity" in upgraded:
+    if not isinstance(upgraded, dict):
+        return upgraded
+    if "fidelity" in upgraded:
         upgraded["fidelity"] = current_fidelity(upgraded["fidelity"])
+    text = upgraded.get("config")
+    if isinstance(text, str) and isinstance(config := parse_yaml(text, "config"), dict):
+        given = upgrade_config(config)
+        upgraded["config"] = to_plain(override_config(ClutterConfig(), given, "config"))
     return upgraded
 
 
