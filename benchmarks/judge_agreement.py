@@ -45,6 +45,7 @@ from drake_clutter.scenes.scene import Scene
 from drake_clutter.stability.static_executor import StaticExecutor
 from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.statistics import wilson_interval
+from drake_clutter.validation import to_plain
 from training.evaluate_generators import verdict_name
 from training.results_file import Row, provenance
 from training.script import ResultsOption, print_table, progress, run_script
@@ -71,31 +72,31 @@ class Confusion:
 
     def metrics(self) -> Row:
         """Return the agreement over the conclusive verdicts, and the rate of each error."""
-        judged = Counter({pair: n for pair, n in self.pairs.items() if pair[0] != "cannot judge"})
+        judged = Counter({pair: n for pair, n in self.pairs.items() if pair[0] != "inconclusive"})
         equal = sum(n for (static, drake), n in judged.items() if static == drake)
         count = judged.total()
         total = self.pairs.total()
-        falling = sum(n for (_, drake), n in judged.items() if drake == "falls")
+        num_unstable = sum(n for (_, drake), n in judged.items() if drake == "unstable")
         called_stable = sum(n for (static, _), n in judged.items() if static == "stable")
-        false_stable = judged["stable", "falls"]
+        false_stable = judged["stable", "unstable"]
         return {
             "count": total,
             "agreement": equal / count,
             "agreement_ci95": wilson_interval(equal, count),
-            "cannot_judge_share": 1 - count / total,
+            "inconclusive_fraction": 1 - count / total,
             "false_stable_rate": false_stable / count,
-            "false_stable_of_falling": false_stable / falling if falling else None,
+            "false_stable_of_unstable": false_stable / num_unstable if num_unstable else None,
             "false_stable_of_called_stable": false_stable / called_stable
             if called_stable
             else None,
-            "false_fall_rate": judged["falls", "stable"] / count,
+            "false_unstable_rate": judged["unstable", "stable"] / count,
             "confusion": self.counts(),
         }
 
     def counts(self) -> dict[str, int]:
         """Return the matrix for a results file."""
         pairs = sorted(self.pairs.items())
-        return {f"fast {static}, drake {drake}": n for (static, drake), n in pairs}
+        return {f"static {static}, Drake {drake}": n for (static, drake), n in pairs}
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ class Disagreement:
     Attributes:
         scene: The scene with this stack only.
         static: The static model's reason of instability, or "stable".
-        drake: Likewise Drake's.
+        drake: Reason of the instability in Drake, or "stable".
     """
 
     scene: Scene
@@ -151,7 +152,7 @@ class BatchComparison:
         for record in records:
             scene, rng = self.batch.lay_out(record["index"])
             verdict = judge.judge(scene, rng)
-            drake = "stable" if "settled" in record else "falls"
+            drake = "stable" if "settled" in record else "unstable"
             if isinstance(verdict, InconclusiveVerdict):
                 self.scenes.pairs[verdict_name(verdict), drake] += 1
             else:
@@ -178,7 +179,7 @@ class BatchComparison:
             ]
             stable_objects = tuple(scene[name] for name in stable_names)
             verdict = judge.find_instability(replace(scene, objects=part.objects + stable_objects))
-        pair = verdict_name(verdict), "stable" if fall is None else "falls"
+        pair = verdict_name(verdict), "stable" if fall is None else "unstable"
         self.stacks.pairs[pair] += 1
         if fall is not None:
             reason, name, *_ = fall
@@ -186,9 +187,9 @@ class BatchComparison:
             self.by_class[scene[name].object_class.name].pairs[pair] += 1
         if verdict is not None:
             self.by_static_reason[verdict.reason.value].pairs[pair] += 1
-        if pair[0] not in ("cannot judge", pair[1]):
+        if pair[0] not in ("inconclusive", pair[1]):
             static = "stable" if verdict is None else str(verdict.reason.value)
-            drake = f"falls: {fall[0]}" if fall else "stable"
+            drake = str(fall[0]) if fall else "stable"
             self.disagreements.append(Disagreement(part, static, drake))
 
     def row(self) -> Row:
@@ -203,9 +204,9 @@ class BatchComparison:
     def details(self) -> dict[str, dict[str, dict[str, int]]]:
         """Return the confusion matrices by reason and by class."""
         parts = {
-            "by_drakes_reason": self.by_drake_reason,
-            "by_class_that_falls": self.by_class,
-            "by_the_fast_judges_reason": self.by_static_reason,
+            "by_drake_reason": self.by_drake_reason,
+            "by_class": self.by_class,
+            "by_static_reason": self.by_static_reason,
         }
         return {
             key: {name: confusion.counts() for name, confusion in sorted(part.items())}
@@ -276,7 +277,7 @@ def compare_moves(batch: SceneBatch, records: Sequence[Record], scenes: dict[int
             instability = outcome.instability
             cause = instability.reason.value if instability else static
             drake_cause = record["fall"][0] if record["fall"] else record["result"]
-            disagreements[f"fast: {cause}"][f"drake: {drake_cause}"] += 1
+            disagreements[f"static: {cause}"][f"Drake: {drake_cause}"] += 1
         if command is not None and record["place"] is not None:
             num_placed += 1
             p, p_drake = command.X_TO_place.translation, record["place"][:3]
@@ -289,10 +290,10 @@ def compare_moves(batch: SceneBatch, records: Sequence[Record], scenes: dict[int
         "count": outcomes.total(),
         "agreement": num_equal / count,
         "agreement_ci95": wilson_interval(num_equal, count),
-        "cannot_judge_share": 1 - count / outcomes.total(),
+        "inconclusive_fraction": 1 - count / outcomes.total(),
         "false_placed_rate": outcomes[MoveResult.PLACED.value, MoveResult.COLLAPSED.value] / count,
-        "same_place_share": num_same_place / num_placed,
-        "confusion": {f"fast {a}, drake {b}": n for (a, b), n in sorted(outcomes.items())},
+        "same_placement_fraction": num_same_place / num_placed,
+        "confusion": {f"static {a}, Drake {b}": n for (a, b), n in sorted(outcomes.items())},
         "disagreements": {cause: dict(counts) for cause, counts in disagreements.items()},
     }
 
@@ -305,10 +306,12 @@ def measure_sensitivity(batch: SceneBatch, records: Sequence[Record]) -> list[Ro
         judge = StaticStabilityJudge(batch.config, margin, friction)
         confusion = Confusion()
         for scene, record in zip(scenes, records, strict=True):
-            drake = "stable" if "settled" in record else "falls"
+            drake = "stable" if "settled" in record else "unstable"
             confusion.pairs[verdict_name(judge.find_instability(scene)), drake] += 1
         metrics = confusion.metrics()
-        rates = {key: metrics[key] for key in ("agreement", "false_stable_rate", "false_fall_rate")}
+        rates = {
+            key: metrics[key] for key in ("agreement", "false_stable_rate", "false_unstable_rate")
+        }
         rows.append({"margin_mm": 1000 * margin, "friction": friction} | rates)
     return rows
 
@@ -330,8 +333,8 @@ def draw_disagreements(disagreements: Sequence[Disagreement], path: Path) -> Non
             replace(o, X_TO=o.X_TO.translated((-x, -y, 0.0))) for o in item.scene.objects
         )
         picture = renderer.render_oblique(replace(item.scene, objects=centered, graph=None))
-        axis.imshow(picture[110:510, 290:690])
-        axis.set_title(f"static: {item.static}\nDrake: {item.drake}", fontsize=13)
+        axis.imshow(picture[:520, 230:750])
+        axis.set_title(f"static judge: {item.static}\nDrake: {item.drake}", fontsize=13)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
     plt.close(figure)
@@ -347,7 +350,7 @@ def show_results(results: Row) -> None:
             "agreement": f"{row['agreement']:.3f}",
             "95 % interval": "{:.3f} to {:.3f}".format(*row["agreement_ci95"]),
             "false stable": f"{row['false_stable_rate']:.3f}",
-            "inconclusive": f"{row['cannot_judge_share']:.3f}",
+            "inconclusive": f"{row['inconclusive_fraction']:.3f}",
             "hidden objects agree": f"{row['hidden_agreement']:.3f}",
         }
         for row in results["scenes"]
@@ -361,7 +364,7 @@ def show_results(results: Row) -> None:
             "on stacks": f"{row['stacks_agreement']:.3f}",
             "hidden objects agree": f"{row['hidden_agreement']:.3f}",
         }
-        for row in results["drake_itself"]
+        for row in results["drake_variants"]
     ]
     print_table(rows, "Drake and Drake with other settings")
     moves = results["moves"]
@@ -420,7 +423,7 @@ def main(
 
     results: Row = {
         **provenance(),
-        "config": read_jsonl(folder / f"{first.name}.jsonl.gz")[0]["config"],
+        "config": to_plain(first.config),
         "scene_agreement": by_size("agreement"),
         "false_stable_rate": by_size("false_stable_rate"),
         "hidden_agreement": by_size("hidden_agreement"),
@@ -428,7 +431,7 @@ def main(
         "drake_self_agreement": {row["variant"]: row["agreement"] for row in self_agreement},
         "scenes": agreement,
         "moves": moves_row,
-        "drake_itself": self_agreement,
+        "drake_variants": self_agreement,
         "sensitivity": measure_sensitivity(first, records[first]),
         "details": details,
     }

@@ -64,17 +64,17 @@ PYBULLET_STEPS = 480
 PYBULLET_STEPS_BEFORE_REST = 360
 """Number of steps after which objects should rest in PyBullet, 0.5 s before the end."""
 
-# Names of judges and cameras in results files.
-STATIC_COLD = "FastJudge, cold"
-STATIC_WARM = "FastJudge, warm"
-DRAKE = "DrakeJudge"
-DRAKE_ACCURATE = "DrakeJudge, accurate"
-BULLET = "PyBullet"
-RAY_LABELS = "ray caster"
-VTK_LABELS = "Drake VTK labels"
-BULLET_LABELS = "TinyRenderer"
-RAY_FRACTIONS = "shares, ray caster"
-VTK_FRACTIONS = "shares, Drake VTK"
+# Names of judges and renderers in results files.
+STATIC_COLD = "static judge, empty cache"
+STATIC_WARM = "static judge, cached stacks"
+DRAKE = "Drake"
+DRAKE_ACCURATE = "Drake without early stop"
+BULLET = f"PyBullet, {PYBULLET_STEPS} steps"
+RAY_LABELS = "ray caster, label image"
+VTK_LABELS = "Drake VTK, label image"
+BULLET_LABELS = "PyBullet TinyRenderer, label image"
+RAY_FRACTIONS = "ray caster, visible fractions"
+VTK_FRACTIONS = "Drake VTK, visible fractions"
 
 NOTES = {
     "core": "One process on one core; wall-clock times.",
@@ -92,15 +92,15 @@ NOTES = {
     " not included. Lying markers roll away.",
     "agreement": "With the accurate settings. agrees: stability; agrees_on_hidden: hidden objects"
     " of scenes that both call stable; unchanged: both.",
-    "eyes": "640 x 480; shares: the visible fractions of all objects. Every scene was rendered once"
+    "renderers": "640 x 480; visible fractions: of all objects. Every scene was rendered once"
     " before, untimed; PyBullet without shadows.",
     "repeats": f"Static judge and ray caster: median of {REPEATS} rounds; all others: one call.",
     "search": f"Budget {SEARCH_BUDGET} moves; the cache of stacks is cleared before every scene.",
 }
 """What the results mean, for the results file."""
 TARGETS = {
-    "fast_ms_16_objects": "< 0.5",
-    "fast_ms_16_objects_stable": "< 0.5",
+    "static_ms_16_objects": "< 0.5",
+    "static_ms_16_objects_stable": "< 0.5",
     "ratio_to_pybullet": ">= 300",
     "drake_median_s": "< 1.0",
     "drake_verdicts_unchanged": ">= 0.99",
@@ -309,7 +309,7 @@ def judge_metrics(
     is_stable = [stable is True for stable, _ in verdicts]
     on_stable = [s for s, stable in zip(seconds, is_stable, strict=True) if stable]
     row = time_metrics(seconds)
-    row["stable_share"] = float(np.mean(is_stable))
+    row["stable_fraction"] = float(np.mean(is_stable))
     row["stable_median_ms"] = 1000 * float(np.median(on_stable)) if on_stable else None
     if reference:
         pairs = list(zip(verdicts, reference, strict=True))
@@ -379,7 +379,7 @@ def measure_scenes(
     for name, (render, repeats) in cameras.items():
         seconds, _ = time_cases(f"{label}: {name}", render, cases, repeats=repeats)
         camera_rows[name] = time_metrics(seconds)
-    return {"judges": judge_rows, "eyes": camera_rows}
+    return {"judges": judge_rows, "renderers": camera_rows}
 
 
 def measure_growth(count: int, seed: int, judges: Mapping[str, AnyJudge]) -> list[Row]:
@@ -398,7 +398,7 @@ def measure_growth(count: int, seed: int, judges: Mapping[str, AnyJudge]) -> lis
             "objects_mean": float(np.mean([len(case.scene.objects) for case in cases])),
             "nodes": size.nodes,
             "tray_side": size.tray_side,
-            "stable_share_of_drawn": stable_fraction,
+            "stable_fraction_of_samples": stable_fraction,
         }
         rows.append(row | measure_scenes(f"{size.objects} objects", cases, SLOW_SCENES, judges))
     return rows
@@ -434,7 +434,7 @@ def measure_search(cases: Sequence[Case]) -> dict[str, Row]:
             rows[name] |= {
                 "median_s": float(np.median(seconds)),
                 "max_s": max(seconds),
-                "median_moves_tried": float(np.median(moves)),
+                "median_moves_evaluated": float(np.median(moves)),
             }
             rows[name] |= {
                 answer.value: float(np.mean([s.solvability is answer for s in solutions]))
@@ -474,15 +474,15 @@ def show_results(results: Row, console: Console) -> None:
     times = {"median": "median_ms", "mean": "mean_ms", "95 %": "p95_ms", "per s": "per_second"}
     judge_columns = times | {
         "of stable": "stable_median_ms",
-        "stable": "stable_share",
+        "stable": "stable_fraction",
         "agrees": "agrees",
         "on hidden": "agrees_on_hidden",
     }
     console.print(make_table("ms per scene", results["judges"], judge_columns))
-    console.print(make_table("ms per frame", results["eyes"], times))
+    console.print(make_table("ms per frame", results["renderers"], times))
     growth = {
         name: {str(row["objects"]): row[part][name]["mean_ms"] for row in results["growth"]}
-        for part in ("judges", "eyes")
+        for part in ("judges", "renderers")
         for name in results["growth"][0][part]
     }
     sizes = {str(size.objects): str(size.objects) for size in SIZES}
@@ -491,7 +491,7 @@ def show_results(results: Row, console: Console) -> None:
         "scenes": "count",
         "median s": "median_s",
         "max s": "max_s",
-        "moves": "median_moves_tried",
+        "moves": "median_moves_evaluated",
     } | {answer.value: answer.value for answer in Solvability}
     console.print(make_table("search: hidden", results["search"], search_columns))
     targets = {
@@ -506,8 +506,8 @@ def headline_numbers(results: Row) -> dict[str, float]:
     (sixteen,) = (row["judges"][STATIC_COLD] for row in results["growth"] if row["objects"] == 16)
     judges = results["judges"]
     return {
-        "fast_ms_16_objects": sixteen["median_ms"],
-        "fast_ms_16_objects_stable": sixteen["stable_median_ms"],
+        "static_ms_16_objects": sixteen["median_ms"],
+        "static_ms_16_objects_stable": sixteen["stable_median_ms"],
         "ratio_to_pybullet": judges[BULLET]["mean_ms"] / judges[STATIC_COLD]["mean_ms"],
         "drake_median_s": judges[DRAKE]["median_ms"] / 1000,
         "drake_verdicts_unchanged": judges[DRAKE]["unchanged"],

@@ -277,7 +277,7 @@ def fraction(successes: int, count: int) -> dict[str, Any]:
     """Return a fraction with its 95 % interval."""
     return {
         "of": count,
-        "share": successes / count if count else None,
+        "fraction": successes / count if count else None,
         "interval": wilson_interval(successes, count),
     }
 

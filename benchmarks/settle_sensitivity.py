@@ -135,7 +135,7 @@ def main(
         {
             "setting": name,
             "agreement": float(np.mean(np.equal(verdicts, stable["default"]))),
-            "stable_share": float(np.mean(verdicts)),
+            "stable_fraction": float(np.mean(verdicts)),
         }
         for name, verdicts in stable.items()
     ]
@@ -152,7 +152,7 @@ def main(
             {
                 "settings": row["setting"],
                 "agreement with the default": f"{row['agreement']:.3f}",
-                "stable": f"{row['stable_share']:.3f}",
+                "stable": f"{row['stable_fraction']:.3f}",
             }
             for row in rows
         ]

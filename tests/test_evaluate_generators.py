@@ -25,11 +25,11 @@ def test_a_table_of_one_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         "objects": "ycb7",
         "temperature": None,
     }
-    assert sum(row["fast_judge"].values()) == 5
+    assert sum(row["static_judge"].values()) == 5
     drake_stable = sum(
         number
-        for verdicts, number in row["fast_judge"].items()
-        if verdicts.endswith("drake stable")
+        for verdicts, number in row["static_judge"].items()
+        if verdicts.endswith("Drake stable")
     )
     assert drake_stable == round(5 * row["stability_rate"])
     assert sum(row["stack_heights_5cm"]) == round(5 * row["mean_stacks"])

@@ -21,6 +21,7 @@ import results_judge_agreement
 import results_negative
 import results_perception
 from markdown_text import estimate, number, table
+from results_files import with_current_keys
 
 ROOT = Path(__file__).parents[1]
 RESULTS = {
@@ -95,6 +96,14 @@ def test_closed_loop_page_words_reasons_as_the_code_does() -> None:
     row = rows_of(results_closed_loop.page(), "sg_star_25", "depth", "arm", "100")[0]
     assert row[4:7] == ["0.71 (0.61 to 0.79)", "0.83", "0.86 (0.76 to 0.92)"]
     assert row[7].startswith("15 collapsed, 13 remaining objects unreachable by suction")
+
+
+def test_results_files_of_version_0_1_are_read_with_current_keys() -> None:
+    given = {"rows": [{"recall_by_visible_share": {"0 to 0.1": {"share": 0.5}}, "count": 3}]}
+    expected = {
+        "rows": [{"recall_by_visible_fraction": {"0 to 0.1": {"fraction": 0.5}}, "count": 3}]
+    }
+    assert with_current_keys(given) == with_current_keys(expected) == expected
 
 
 def test_missing_numbers_are_empty_cells() -> None:

@@ -92,7 +92,7 @@ class DetectionMetrics:
         num_detections = len(found) + self.num_false_positives
         return {
             "in_view": recall([o for o in self.objects if o.visible_fraction >= threshold]),
-            "recall_by_visible_share": {
+            "recall_by_visible_fraction": {
                 name: recall(by_visibility[name]) for name in sorted(by_visibility)
             },
             "precision": len(recognized) / max(1, num_detections),

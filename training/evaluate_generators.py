@@ -90,8 +90,8 @@ def verdict_name(verdict: Instability | InconclusiveVerdict | None) -> str:
         verdict: How the scene is unstable; None if it is stable.
     """
     if isinstance(verdict, InconclusiveVerdict):
-        return "cannot judge"
-    return "stable" if verdict is None else "falls"
+        return "inconclusive"
+    return "stable" if verdict is None else "unstable"
 
 
 def evaluate_generator(
@@ -128,15 +128,15 @@ def evaluate_generator(
         assert file.verdict is not None
         assert file.scene.graph is not None
         static = verdict_name(static_judge.find_instability(file.scene))
-        confusion[f"fast {static}, drake {'stable' if file.verdict.stable else 'falls'}"] += 1
+        confusion[f"static {static}, Drake {'stable' if file.verdict.stable else 'unstable'}"] += 1
         top = {o.node: o.top_height for o in file.scene.objects}
         for nodes in file.scene.graph.stack_objects():
             heights[int(max(top[node] for node in nodes) // STACK_HEIGHT_BIN)] += 1
-    false_stable = confusion["fast stable, drake falls"]
-    called_stable = confusion["fast stable, drake stable"] + false_stable
+    false_stable = confusion["static stable, Drake unstable"]
+    called_stable = confusion["static stable, Drake stable"] + false_stable
     return summary | {
         "row": asdict(evaluation),
-        "fast_judge": dict(confusion),
+        "static_judge": dict(confusion),
         "false_stable_of_called_stable": false_stable / called_stable if called_stable else None,
         "stack_heights_5cm": [heights[k] for k in range(NUM_STACK_HEIGHT_BINS)],
         **provenance(),

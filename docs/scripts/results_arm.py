@@ -33,8 +33,8 @@ PARTS = {
 
 def _fraction(part: Mapping[str, Any]) -> str:
     low, high = part["interval"]
-    successes = round(part["share"] * part["of"])
-    return f"{part['share']:.3f} ({low:.3f} to {high:.3f}), {successes} of {part['of']}"
+    successes = round(part["fraction"] * part["of"])
+    return f"{part['fraction']:.3f} ({low:.3f} to {high:.3f}), {successes} of {part['of']}"
 
 
 def _moves() -> str:

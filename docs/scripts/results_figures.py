@@ -58,14 +58,14 @@ FRACTIONS = {
 """Labels of fractions drawn over the temperature, by key."""
 TIMED = {
     "judges": {
-        "PyBullet": "PyBullet, 480 steps",
-        "DrakeJudge": "Drake",
-        "FastJudge, cold": "static judge",
+        "PyBullet, 480 steps": "PyBullet, 480 steps",
+        "Drake": "Drake",
+        "static judge, empty cache": "static judge",
     },
-    "eyes": {
-        "TinyRenderer": "PyBullet TinyRenderer",
-        "Drake VTK labels": "Drake VTK",
-        "ray caster": "ray caster",
+    "renderers": {
+        "PyBullet TinyRenderer, label image": "PyBullet TinyRenderer",
+        "Drake VTK, label image": "Drake VTK",
+        "ray caster, label image": "ray caster",
     },
 }
 """Labels of judges and renderers, by their names in the results file."""

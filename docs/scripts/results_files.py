@@ -38,15 +38,45 @@ POLICIES = {
 """Short names of exploration policies, by the name or checkpoint in results files."""
 
 
+RENAMED_KEYS = {
+    "recall_by_visible_share": "recall_by_visible_fraction",
+    "share": "fraction",
+    "eyes": "renderers",
+    "FastJudge, cold": "static judge, empty cache",
+    "FastJudge, warm": "static judge, cached stacks",
+    "DrakeJudge": "Drake",
+    "DrakeJudge, accurate": "Drake without early stop",
+    "PyBullet": "PyBullet, 480 steps",
+    "TinyRenderer": "PyBullet TinyRenderer, label image",
+    "ray caster": "ray caster, label image",
+    "Drake VTK labels": "Drake VTK, label image",
+    "shares, ray caster": "ray caster, visible fractions",
+    "shares, Drake VTK": "Drake VTK, visible fractions",
+    "median_moves_tried": "median_moves_evaluated",
+    "fast_ms_16_objects": "static_ms_16_objects",
+}
+"""Current keys, by those in results files of version 0.1."""
+
+
+def with_current_keys(content: Any) -> Any:
+    """Return the content of a results file with current keys."""
+    if isinstance(content, list):
+        return [with_current_keys(item) for item in content]
+    if not isinstance(content, dict):
+        return content
+    return {RENAMED_KEYS.get(key, key): with_current_keys(item) for key, item in content.items()}
+
+
 def read_training_results(name: str) -> dict[str, Any]:
     """Return the content of a file of training/results."""
-    content: dict[str, Any] = json.loads((TRAINING / name).read_text(encoding="utf-8"))
+    text = (TRAINING / name).read_text(encoding="utf-8")
+    content: dict[str, Any] = with_current_keys(json.loads(text))
     return content
 
 
 def read_benchmark_results(name: str) -> Any:
     """Return the content of a file of benchmarks/results."""
-    return json.loads((BENCHMARKS / name).read_text(encoding="utf-8"))
+    return with_current_keys(json.loads((BENCHMARKS / name).read_text(encoding="utf-8")))
 
 
 def read_episodes(path: Path) -> list[dict[str, Any]]:

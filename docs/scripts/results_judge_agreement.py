@@ -8,28 +8,6 @@ import numpy as np
 from markdown_text import estimate, figure, number, section, significant, table
 from results_files import BENCHMARKS, read_benchmark_results, read_episodes
 
-JUDGES = {
-    "FastJudge, cold": "static judge, empty cache",
-    "FastJudge, warm": "static judge, cached stacks",
-    "DrakeJudge": "Drake",
-    "DrakeJudge, accurate": "Drake without early stop",
-    "PyBullet": "PyBullet, 480 steps",
-}
-"""Names of judges, by their names in results files of version 0.1."""
-RENDERERS = {
-    "TinyRenderer": "PyBullet TinyRenderer, label image",
-    "ray caster": "ray caster, label image",
-    "Drake VTK labels": "Drake VTK, label image",
-    "shares, ray caster": "ray caster, visible fractions",
-    "shares, Drake VTK": "Drake VTK, visible fractions",
-}
-"""Names of renderers, by their names in results files of version 0.1."""
-VERDICTS = {
-    "cannot judge": "inconclusive",
-    "cannot be judged": "inconclusive",
-    "falls": "unstable",
-}
-"""Current wording of verdicts in results files of version 0.1."""
 REASONS = {
     "balanced on a lying cylinder": "balanced on a lying cylinder",
     "floats in the air": "inconclusive: floating",
@@ -38,14 +16,14 @@ REASONS = {
     "stands beside what should carry it": "placed beside its support",
     "stable": "stable",
 }
-"""Current wording of the static judge's reasons in results files of version 0.1."""
+"""Wording of the static judge's reasons on the page, by that in results files."""
 
 
 def _verdict_pair(key: str) -> tuple[str, str]:
-    """Return the static judge's and Drake's verdict of a key such as "fast falls, drake stable"."""
+    """Return the two verdicts of a key such as "static unstable, Drake stable"."""
     static, drake = key.split(", ")
-    static, drake = static.removeprefix("fast "), drake.removeprefix("drake ")
-    return VERDICTS.get(static, static), VERDICTS.get(drake, drake)
+    static, drake = static.removeprefix("static "), drake.removeprefix("Drake ")
+    return "inconclusive" if static == "cannot be judged" else static, drake
 
 
 def _scenes(results: Mapping[str, Any]) -> str:
@@ -70,8 +48,8 @@ def _scenes(results: Mapping[str, Any]) -> str:
                 str(row["count"]),
                 estimate(row, "agreement", "agreement_ci95", 3),
                 number(row["false_stable_rate"], 3),
-                number(row["false_fall_rate"], 3),
-                number(row["cannot_judge_share"], 3),
+                number(row["false_unstable_rate"], 3),
+                number(row["inconclusive_fraction"], 3),
                 number(row["hidden_agreement"], 3),
             ]
             for row in results["scenes"]
@@ -104,7 +82,7 @@ def _drake_itself(results: Mapping[str, Any]) -> str:
                 estimate(row, "agreement", "agreement_ci95", 3),
                 estimate(row, "hidden_agreement", "hidden_agreement_ci95", 3),
             ]
-            for row in results["drake_itself"]
+            for row in results["drake_variants"]
         ],
     )
 
@@ -134,8 +112,8 @@ def _reasons(results: Mapping[str, Any]) -> str:
         results=["benchmarks/results/judges.json"],
     )
     reasons = {
-        **details["by_the_fast_judges_reason"],
-        "stable": {key: count for key, count in stacks.items() if key.startswith("fast stable")},
+        **details["by_static_reason"],
+        "stable": {key: count for key, count in stacks.items() if key.startswith("static stable")},
     }
     return text + table(
         ["static judge", "Drake: unstable", "Drake: stable"],
@@ -154,7 +132,7 @@ def _by_drake(counts: Mapping[str, int]) -> list[str]:
 
 
 def _classes(results: Mapping[str, Any]) -> str:
-    classes = results["details"]["ycb7, 25 nodes"]["by_class_that_falls"]
+    classes = results["details"]["ycb7, 25 nodes"]["by_class"]
     text = section(
         "Stacks by class",
         "Stacks of the 25-node scenes of ycb7 that are unstable in Drake, by the class of the "
@@ -186,7 +164,7 @@ def _sensitivity(results: Mapping[str, Any]) -> str:
                 f"{row['friction']:g}",
                 number(row["agreement"], 3),
                 number(row["false_stable_rate"], 3),
-                number(row["false_fall_rate"], 3),
+                number(row["false_unstable_rate"], 3),
             ]
             for row in results["sensitivity"]
         ],
@@ -209,7 +187,7 @@ def _speed() -> str:
         head,
         [
             [
-                JUDGES[name],
+                name,
                 significant(row["median_ms"]),
                 significant(row["mean_ms"]),
                 significant(row["per_second"]),
@@ -221,15 +199,14 @@ def _speed() -> str:
     targets = results["targets"]
     text += (
         f"\nThe static judge with an empty cache is {targets['ratio_to_pybullet']:.0f} times as "
-        "fast "
-        "as 480 steps of PyBullet. A scene of 16 objects takes "
-        f"{targets['fast_ms_16_objects']:.2f} ms at the median.\n\n"
+        "fast as 480 steps of PyBullet. A scene of 16 objects takes "
+        f"{targets['static_ms_16_objects']:.2f} ms at the median.\n\n"
     )
     text += table(
         ["renderer, 640 x 480", "median [ms]", "images per second"],
         [
-            [RENDERERS[name], significant(row["median_ms"]), significant(row["per_second"])]
-            for name, row in results["eyes"].items()
+            [name, significant(row["median_ms"]), significant(row["per_second"])]
+            for name, row in results["renderers"].items()
         ],
     )
     return text + "\n" + figure("speed_growth.png", "Time per scene by number of objects.")
@@ -253,7 +230,7 @@ def _oracle() -> str:
                 name,
                 str(row["count"]),
                 f"{row['median_s']:.2g}",
-                number(row["median_moves_tried"], 0),
+                number(row["median_moves_evaluated"], 0),
                 *(number(row[key]) for key in ("solvable", "proved unsolvable", "undecided")),
             ]
             for name, row in search.items()

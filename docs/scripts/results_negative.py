@@ -146,9 +146,9 @@ def _arm() -> list[Line]:
     return [
         (
             "Coarse resampling of optimized trajectories",
-            f"{cut['share']:.3f} of the planned moves executed (n = {cut['of']}), with fine "
+            f"{cut['fraction']:.3f} of the planned moves executed (n = {cut['of']}), with fine "
             "resampling "
-            f"{full['share']:.3f} (n = {full['of']}): the cup left the surface at a slant.",
+            f"{full['fraction']:.3f} (n = {full['of']}): the cup left the surface at a slant.",
             "benchmarks/results/arm_moves_cut_ends.json",
         ),
         (
@@ -163,7 +163,7 @@ def _stability() -> list[Line]:
     rows = read_benchmark_results("calibration_explored.json")
     by_speed = [row for row in rows if "instantaneous speed" in row["tried"] and row["nodes"] == 25]
     count = by_speed[0]["instability_reasons"]["not at rest in time"]
-    environment = read_benchmark_results("speed.json")["judges"]["PyBullet"]
+    environment = read_benchmark_results("speed.json")["judges"]["PyBullet, 480 steps"]
     return [
         (
             "Rest criterion by instantaneous speed (5 mm/s)",

@@ -59,7 +59,7 @@ def _visibility() -> str:
         ["visible fraction", "objects", "recall"],
         [
             [label, str(row["objects"]), estimate(row, "recall", "ci95")]
-            for label, row in rows["recall_by_visible_share"].items()
+            for label, row in rows["recall_by_visible_fraction"].items()
         ],
     )
 
