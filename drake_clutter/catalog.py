@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from drake_clutter.files import InputError, format_value, input_error
+from drake_clutter.mesh_file import load_object_mesh
 from drake_clutter.resources import resource_path
 from drake_clutter.validation import InRange, NonEmptyText, StrictModel, allowed_error, validate
 from drake_clutter.yaml_io import read_yaml
@@ -101,7 +102,8 @@ class ClassEntry(StrictModel):
         source: Source of size and mass.
         pairs: Arrangements in which two objects of the class stand as a pair.
         only_rest: Only orientation at rest (cans stand, a marker lies); None if it varies.
-        mesh: Path of a watertight mesh in meters, relative to the catalog; for shape mesh only.
+        mesh: Path of a closed mesh in meters, relative to the catalog; for shape mesh only. glTF
+            files are y up, all others z up.
         label: How its texture is drawn.
     """
 
@@ -199,13 +201,17 @@ class ObjectClass:
         """Path of the built SDF model, after a check of its mass against the catalog.
 
         Raises:
-            InputError: The model is missing, or was built with another mass.
+            InputError: The model is missing or damaged, or was built with another mass.
         """
         remedy = f"run `drake-clutter assets build {self.folder.parent}`"
         if not self.sdf_path.is_file():
             raise InputError(f"{self.folder}: class {self.name} has no assets; {remedy}")
-        mass = ElementTree.parse(self.sdf_path).findtext("model/link/inertial/mass", "nan")
-        if not math.isclose(float(mass), self.mass, rel_tol=1e-5):
+        try:
+            text = ElementTree.parse(self.sdf_path).findtext("model/link/inertial/mass", "nan")
+            mass = float(text)
+        except (ElementTree.ParseError, ValueError) as error:
+            raise InputError(f"{self.sdf_path}: cannot be read ({error}); {remedy}") from error
+        if not math.isclose(mass, self.mass, rel_tol=1e-5):
             raise InputError(
                 f"{self.sdf_path}: mass: {mass}; expected the catalog's, {self.mass:g} kg; {remedy}"
             )
@@ -231,13 +237,21 @@ class ObjectClass:
                     [np.column_stack([ring, np.full(len(ring), z)]) for z in (-half[2], half[2])]
                 ),
             )
-        pieces = sorted(self.folder.glob("convex_*.obj"))
-        if not pieces:
-            raise InputError(
-                f"{self.folder}: class {self.name} has no assets; "
-                f"run `drake-clutter assets build {self.folder.parent}`"
-            )
-        return tuple(np.asarray(trimesh.load_mesh(piece).vertices, float) for piece in pieces)
+        remedy = f"run `drake-clutter assets build {self.folder.parent}`"
+        files = sorted(self.folder.glob("convex_*.obj"))
+        if not files:
+            raise InputError(f"{self.folder}: class {self.name} has no assets; {remedy}")
+        pieces = tuple(np.asarray(trimesh.load_mesh(file).vertices, float) for file in files)
+        if not np.allclose(np.ptp(np.vstack(pieces), axis=0), self.size, rtol=0.02, atol=1e-4):
+            raise InputError(f"{self.folder}: was built from another mesh; {remedy}")
+        return pieces
+
+    @cached_property
+    def surface_triangles(self) -> NDArray[np.float64]:
+        """Corners of the triangles of a mesh's surface in O [m]. Shape (F, 3, 3)."""
+        assert self.mesh is not None, f"class {self.name} is not a mesh"
+        where = f"{catalog_path(self.folder.parent)}: classes.{self.name}.mesh"
+        return np.asarray(load_object_mesh(self.mesh, where).solid.triangles, float)
 
     @cached_property
     def corners(self) -> NDArray[np.float64]:
@@ -272,40 +286,12 @@ class Catalog:
         return tuple(self.classes[class_name] for class_name in self.object_sets[name])
 
 
-def _measure_mesh(path: Path, where: str) -> tuple[float, float, float]:
-    """Return the extents of a watertight mesh [m].
-
-    Args:
-        path: The mesh file.
-        where: Field of the catalog, for error messages.
-
-    Raises:
-        InputError: The mesh cannot be read, is not watertight, or has an unsuitable size.
-    """
-    if not path.is_file():
-        raise InputError(f"{where}.mesh: no file {path}; give a path relative to the catalog")
-    try:
-        mesh = trimesh.load_mesh(path)
-    except Exception as error:  # trimesh raises exceptions of many types
-        raise InputError(f"{where}.mesh: {path} cannot be read as a mesh ({error})") from error
-    if not isinstance(mesh, trimesh.Trimesh) or not mesh.is_watertight or mesh.volume <= 0:
-        raise InputError(
-            f"{where}.mesh: {path} is not watertight; give a closed surface with outward normals"
-        )
-    x, y, z = (float(extent) for extent in mesh.extents)
-    if not 0.003 <= min(x, y, z) <= max(x, y, z) <= 1.0:
-        raise InputError(
-            f"{where}.mesh: {path} measures {x:.4g} x {y:.4g} x {z:.4g} m; "
-            "expected 0.003 to 1 m a side (units are meters)"
-        )
-    return x, y, z
-
-
 def _make_object_class(name: str, entry: ClassEntry, folder: Path, where: str) -> ObjectClass:
     """Return the class of an entry of a catalog."""
     mesh = folder / entry.mesh if entry.mesh else None
     if mesh is not None:
-        size = _measure_mesh(mesh, where)
+        extents = load_object_mesh(mesh, f"{where}.mesh").solid.extents
+        size = (float(extents[0]), float(extents[1]), float(extents[2]))
     else:
         assert entry.size_mm is not None
         x, y, z = (s / 1000 for s in entry.size_mm)

@@ -1,5 +1,7 @@
 """Building an object class: SDF model, collision geometry, textured visual."""
 
+import io
+import math
 import os
 import re
 import secrets
@@ -7,6 +9,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from xml.etree import ElementTree
 from xml.sax.saxutils import escape
 
 import numpy as np
@@ -14,6 +17,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from drake_clutter.assets.contact_properties import proximity_properties_sdf
+from drake_clutter.assets.mesh_appearance import has_appearance, textured_parts
 from drake_clutter.assets.textured_mesh import box_mesh, cylinder_mesh, gltf_text, map_strip_texture
 from drake_clutter.assets.textures import draw_texture, encode_png
 from drake_clutter.catalog import (
@@ -25,6 +29,15 @@ from drake_clutter.catalog import (
     load_catalog,
 )
 from drake_clutter.files import InputError, write_text
+from drake_clutter.mesh_file import (
+    MAX_INVERTED_FRACTION,
+    MAX_OVERLAP_FRACTION,
+    ObjectMesh,
+    format_point,
+    is_flat,
+    load_object_mesh,
+    measure_windings,
+)
 from drake_clutter.resources import resource_path
 
 _SHIPPED_PACKAGE = "drake_clutter_objects"
@@ -108,13 +121,6 @@ class _Inertial:
     inertia: NDArray[np.float64]
 
 
-def _load_centered_mesh(path: Path) -> trimesh.Trimesh:
-    """Return a mesh with the center of its bounding box at the origin."""
-    mesh = trimesh.load_mesh(path)
-    mesh.apply_translation(-mesh.bounds.mean(axis=0))
-    return mesh
-
-
 def _compute_inertial(object_class: ObjectClass, mesh: trimesh.Trimesh | None) -> _Inertial:
     """Return the mass distribution of a solid of uniform density."""
     mass = object_class.mass
@@ -137,8 +143,12 @@ def _compute_inertial(object_class: ObjectClass, mesh: trimesh.Trimesh | None) -
 def _decompose_convex(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
     """Return convex hulls that cover a mesh; one for a convex mesh.
 
-    The decomposition is CoACD (Wei et al. 2022).
+    The decomposition is CoACD (Wei et al. 2022). Bodies are decomposed one by one, because CoACD
+    does not return for some meshes of separate bodies; a body with a cavity stays whole.
     """
+    bodies = list(mesh.split(only_watertight=False))
+    if len(bodies) > 1 and all(body.volume > 0 for body in bodies):
+        return [piece for body in bodies for piece in _decompose_convex(body)]
     if mesh.volume > _CONVEX_VOLUME_RATIO * mesh.convex_hull.volume:
         return [mesh.convex_hull]
     import coacd  # here, because it breaks Drake's SDF reader when loaded before Drake
@@ -146,11 +156,10 @@ def _decompose_convex(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
     coacd.set_log_level("error")
     pieces = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), **_COACD_OPTIONS)
     low, high = mesh.bounds
-    # Clipped, because objects are stacked on the bounding box.
-    return [
-        trimesh.Trimesh(np.clip(vertices, low, high), faces).convex_hull
-        for vertices, faces in pieces
-    ]
+    # Clipped, because objects are stacked on the bounding box. A piece that is flat afterwards has
+    # no volume, and is left out.
+    clipped = [np.clip(vertices, low, high) for vertices, _ in pieces]
+    return [trimesh.convex.convex_hull(points) for points in clipped if not is_flat(points)]
 
 
 def _obj_text(mesh: trimesh.Trimesh) -> str:
@@ -198,19 +207,61 @@ def _collisions_sdf(object_class: ObjectClass, num_pieces: int) -> str:
     )
 
 
-def _make_asset_files(object_class: ObjectClass) -> dict[str, str]:
+def _mesh_where(object_class: ObjectClass) -> str:
+    """Return the field of the catalog that names a class's mesh, for error messages."""
+    return f"{catalog_path(object_class.folder.parent)}: classes.{object_class.name}.mesh"
+
+
+def _load_checked_mesh(object_class: ObjectClass, repair: bool) -> ObjectMesh | None:
+    """Return the mesh of a class, or None for a box or a cylinder.
+
+    Args:
+        object_class: The class.
+        repair: Whether small holes may be closed.
+
+    Raises:
+        InputError: The mesh has holes, or bodies that overlap or are inside out.
+    """
+    if object_class.mesh is None:
+        return None
+    where = f"{_mesh_where(object_class)}: {object_class.mesh}"
+    mesh = load_object_mesh(object_class.mesh, _mesh_where(object_class))
+    if mesh.holes and not repair:
+        raise InputError(
+            f"{where}: is not watertight: {mesh.holes[0]}; "
+            "close it, or run `drake-clutter assets build --repair`"
+        )
+    inverted, overlap = measure_windings(mesh.solid)
+    for defect, limit, text in (
+        (inverted, MAX_INVERTED_FRACTION, "is inside out"),
+        (overlap, MAX_OVERLAP_FRACTION, "is covered twice, which counts twice in the inertia"),
+    ):
+        if defect.fraction > limit:
+            raise InputError(
+                f"{where}: {defect.fraction:.1%} of its volume {text}, as at "
+                f"{format_point(defect.place + mesh.center)}; unite bodies that overlap, "
+                "and remove surfaces that intersect"
+            )
+    return mesh
+
+
+def _make_asset_files(object_class: ObjectClass, object_mesh: ObjectMesh | None) -> dict[str, str]:
     """Return the contents of every file of a class, by file name."""
-    mesh = _load_centered_mesh(object_class.mesh) if object_class.mesh else None
+    mesh = object_mesh.solid if object_mesh is not None else None
     texture = draw_texture(object_class)
-    if mesh is not None:
-        surface = map_strip_texture(mesh, texture.regions["side"])
-    elif object_class.shape is Shape.BOX:
-        surface = box_mesh(object_class.size, texture.regions)
-    else:
-        surface = cylinder_mesh(object_class.size, texture.regions)
     pieces = _decompose_convex(mesh) if mesh is not None else []
     files = {f"convex_{index:03d}.obj": _obj_text(piece) for index, piece in enumerate(pieces)}
-    files["visual.gltf"] = gltf_text(surface, encode_png(texture.image))
+    if object_mesh is not None and object_class.mesh and has_appearance(object_mesh):
+        parts = textured_parts(object_mesh, object_class.mesh)
+        files["visual.gltf"] = gltf_text(parts, repeat=True)
+    else:
+        if mesh is not None:
+            surface = map_strip_texture(mesh, texture.regions["side"])
+        elif object_class.shape is Shape.BOX:
+            surface = box_mesh(object_class.size, texture.regions)
+        else:
+            surface = cylinder_mesh(object_class.size, texture.regions)
+        files["visual.gltf"] = gltf_text([(surface, encode_png(texture.image))])
     inertial = _compute_inertial(object_class, mesh)
     files["model.sdf"] = _MODEL_SDF.format(
         name=object_class.name,
@@ -228,20 +279,74 @@ def _make_asset_files(object_class: ObjectClass) -> dict[str, str]:
     return files
 
 
+def _check_built_files(object_class: ObjectClass, files: dict[str, str]) -> None:
+    """Raise an error unless the written model is physical and has the size of its class.
+
+    Raises:
+        InputError: A moment of inertia is not that of a solid, a convex piece has no volume, or the
+            pieces do not fill the bounding box.
+    """
+    where = f"{object_class.folder}"
+    inertial = ElementTree.fromstring(files["model.sdf"]).find("model/link/inertial")
+    assert inertial is not None
+    mass = float(inertial.findtext("mass", "nan"))
+    if not math.isclose(mass, object_class.mass, rel_tol=1e-9):
+        raise InputError(f"{where}/model.sdf: mass: {mass}; expected {object_class.mass:g} kg")
+    entry = {
+        name: float(inertial.findtext(f"inertia/{name}", "nan"))
+        for name in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+    }
+    matrix = np.array(
+        [
+            [entry["ixx"], entry["ixy"], entry["ixz"]],
+            [entry["ixy"], entry["iyy"], entry["iyz"]],
+            [entry["ixz"], entry["iyz"], entry["izz"]],
+        ]
+    )
+    moments = np.linalg.eigvalsh(matrix) if np.isfinite(matrix).all() else np.zeros(3)
+    # Each principal moment is positive and at most the sum of the other two.
+    if not 0 < moments[0] <= moments[2] <= (moments[0] + moments[1]) * (1 + 1e-9):
+        raise InputError(
+            f"{where}/model.sdf: inertia: principal moments {format_point(moments)} kg m^2 are not "
+            "those of a solid; check the mesh for surfaces that intersect"
+        )
+    if object_class.shape is not Shape.MESH:
+        return
+    corners = []
+    for name in sorted(files):
+        if name.endswith(".obj"):
+            piece = trimesh.load_mesh(io.StringIO(files[name]), file_type="obj")
+            if not piece.is_watertight or is_flat(np.asarray(piece.vertices)) or piece.volume <= 0:
+                raise InputError(f"{where}/{name}: is not a convex solid; simplify the mesh")
+            corners.append(np.asarray(piece.vertices))
+    extents = np.ptp(np.vstack(corners), axis=0) if corners else np.zeros(3)
+    if not np.allclose(extents, object_class.size, rtol=0.02, atol=1e-4):
+        raise InputError(
+            f"{where}: the convex pieces measure {format_point(extents)} m; "
+            f"expected {format_point(np.asarray(object_class.size))} m; simplify the mesh"
+        )
+
+
 def _comment_text(text: str) -> str:
     """Return text that can stand in an XML comment, which may not contain "--"."""
     return re.sub(r"-{2,}", "-", text).rstrip("-")  # XML comments may not hold two hyphens
 
 
-def build_class(object_class: ObjectClass, folder: Path) -> Path:
+def build_class(object_class: ObjectClass, folder: Path, *, repair: bool = False) -> Path:
     """Build a class into `<folder>/<class>/`, replacing an earlier build.
+
+    Args:
+        object_class: The class.
+        folder: The asset folder.
+        repair: Whether small holes of a mesh are closed.
 
     Returns:
         The folder of the class, with `model.sdf`, `visual.gltf` and, for a mesh,
         `convex_000.obj`, ...
 
     Raises:
-        InputError: The folder holds other files, or the label cannot be drawn.
+        InputError: The folder holds other files, the label cannot be drawn, or the mesh has a
+            defect.
     """
     target = folder / object_class.name
     if target.exists():
@@ -255,7 +360,9 @@ def build_class(object_class: ObjectClass, folder: Path) -> Path:
                 f"{target}: holds {sorted(foreign_files)[0]}; "
                 "expected a folder that only `assets build` fills"
             )
-    files = _make_asset_files(object_class)
+    mesh = _load_checked_mesh(object_class, repair)
+    files = _make_asset_files(object_class, mesh)
+    _check_built_files(object_class, files)
     staging = folder / f".{object_class.name}.{secrets.token_hex(4)}"
     staging.mkdir(parents=True)
     try:
@@ -268,12 +375,23 @@ def build_class(object_class: ObjectClass, folder: Path) -> Path:
     return target
 
 
-def build_assets(folder: Path, names: Sequence[str] | None = None) -> list[Path]:
+def mesh_repairs(object_class: ObjectClass) -> tuple[str, ...]:
+    """Return what a build repairs in the mesh of a class."""
+    if object_class.mesh is None:
+        return ()
+    mesh = load_object_mesh(object_class.mesh, _mesh_where(object_class))
+    return mesh.repairs + tuple(f"closed {hole}" for hole in mesh.holes)
+
+
+def build_assets(
+    folder: Path, names: Sequence[str] | None = None, *, repair: bool = False
+) -> list[Path]:
     """Build the classes of an asset folder's own catalog, and its `package.xml`.
 
     Args:
         folder: The asset folder, which holds `catalog.yaml`.
         names: Names of the classes to build, or None for all.
+        repair: Whether small holes of meshes are closed.
 
     Returns:
         The folders of the classes, in the order of the catalog.
@@ -295,7 +413,7 @@ def build_assets(folder: Path, names: Sequence[str] | None = None) -> list[Path]
     if not os.access(folder, os.W_OK):
         raise InputError(f"{folder}: is not writable; give an asset folder that you may write")
     built = [
-        build_class(entry, folder)
+        build_class(entry, folder, repair=repair)
         for name, entry in own_classes.items()
         if names is None or name in names
     ]

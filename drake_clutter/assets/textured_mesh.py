@@ -7,6 +7,7 @@ right one. A region (u0, v0, u1, v1) is a rectangle of the picture.
 import base64
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -149,62 +150,71 @@ def _data_uri(kind: str, data: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
-def gltf_text(surface: TexturedMesh, texture_png: bytes) -> str:
-    """Return the content of one glTF file with an embedded PNG texture."""
+def gltf_text(parts: Sequence[tuple[TexturedMesh, bytes]], *, repeat: bool = False) -> str:
+    """Return the content of one glTF file with embedded PNG textures.
+
+    Args:
+        parts: Meshes and their textures.
+        repeat: Whether textures repeat outside of [0, 1].
+    """
     # The y axis of glTF points up; Drake rotates it back to z.
     y_up = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
-    arrays: list[tuple[NDArray[Any], str, int]] = [
-        ((surface.points @ y_up.T).astype("<f4"), "VEC3", 34962),
-        ((surface.normals @ y_up.T).astype("<f4"), "VEC3", 34962),
-        (surface.uv.astype("<f4"), "VEC2", 34962),
-        (surface.triangles.reshape(-1).astype("<u4"), "SCALAR", 34963),
-    ]
-    views, accessors, buffer = [], [], b""
-    for index, (array, kind, target) in enumerate(arrays):
-        data = array.tobytes()
-        views.append(
-            {"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data), "target": target}
+    views = []
+    accessors: list[dict[str, Any]] = []
+    primitives = []
+    buffer = b""
+    for material, (surface, _) in enumerate(parts):
+        first = len(accessors)
+        arrays: list[tuple[NDArray[Any], str, int]] = [
+            ((surface.points @ y_up.T).astype("<f4"), "VEC3", 34962),
+            ((surface.normals @ y_up.T).astype("<f4"), "VEC3", 34962),
+            (surface.uv.astype("<f4"), "VEC2", 34962),
+            (surface.triangles.reshape(-1).astype("<u4"), "SCALAR", 34963),
+        ]
+        for index, (array, kind, target) in enumerate(arrays):
+            data = array.tobytes()
+            views.append(
+                {"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data), "target": target}
+            )
+            accessor: dict[str, Any] = {
+                "bufferView": first + index,
+                "componentType": 5125 if kind == "SCALAR" else 5126,
+                "count": len(array),
+                "type": kind,
+            }
+            if index == 0:
+                accessor |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
+            accessors.append(accessor)
+            buffer += data
+        primitives.append(
+            {
+                "attributes": {"POSITION": first, "NORMAL": first + 1, "TEXCOORD_0": first + 2},
+                "indices": first + 3,
+                "material": material,
+            }
         )
-        accessor = {
-            "bufferView": index,
-            "componentType": 5125 if kind == "SCALAR" else 5126,
-            "count": len(array),
-            "type": kind,
-        }
-        if index == 0:
-            accessor |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
-        accessors.append(accessor)
-        buffer += data
+    wrap = 10497 if repeat else 33071
     document = {
         "asset": {"version": "2.0", "generator": "drake_clutter"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [
-            {
-                "primitives": [
-                    {
-                        "attributes": {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2},
-                        "indices": 3,
-                        "material": 0,
-                    }
-                ]
-            }
-        ],
+        "meshes": [{"primitives": primitives}],
         "materials": [
             {
                 "pbrMetallicRoughness": {
-                    "baseColorTexture": {"index": 0},
+                    "baseColorTexture": {"index": index},
                     "metallicFactor": 0.0,
                     "roughnessFactor": 0.8,
                 }
             }
+            for index in range(len(parts))
         ],
-        "textures": [{"sampler": 0, "source": 0}],
+        "textures": [{"sampler": 0, "source": index} for index in range(len(parts))],
         # Linear, without mipmaps: with mipmaps, Mesa's software renderer hangs on a face that is
         # seen exactly edge-on.
-        "samplers": [{"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}],
-        "images": [{"uri": _data_uri("image/png", texture_png)}],
+        "samplers": [{"magFilter": 9729, "minFilter": 9729, "wrapS": wrap, "wrapT": wrap}],
+        "images": [{"uri": _data_uri("image/png", png)} for _, png in parts],
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [

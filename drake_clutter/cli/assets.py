@@ -22,9 +22,15 @@ def build(
         list[str] | None,
         typer.Option("--class", help="Build only this class. May be repeated."),
     ] = None,
+    repair: Annotated[
+        bool, typer.Option("--repair", help="Close small holes of meshes, and list them.")
+    ] = False,
 ) -> None:
     """Build the SDF models, collision geometry and textures of a catalog."""
-    from drake_clutter.assets import build_assets
+    from drake_clutter.assets import build_assets, mesh_repairs
+    from drake_clutter.catalog import load_catalog
 
-    for built in build_assets(folder, classes):
+    for built in build_assets(folder, classes, repair=repair):
         print_line(f"Built {built}.")
+        for text in mesh_repairs(load_catalog(folder.resolve()).classes[built.name]):
+            print_line(f"  Mesh: {text}.")

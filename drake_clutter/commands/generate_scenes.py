@@ -107,7 +107,9 @@ def generate_scenes(
     make_generation_agent(job.agent, job.config, job.temperature)
     catalog = load_catalog(job.catalog_folder)
     for object_class in catalog.object_set(job.objects):
-        _ = object_class.corners  # raises if a model is missing, before anything is written
+        # These raise if a model is missing or disagrees, before anything is written.
+        _ = object_class.verified_sdf_path
+        _ = object_class.corners
     entries = (JOB_FILE, PROGRESS_FILE, SUMMARY_FILE, CONTACT_SHEET_FILE, SCENES_FOLDER)
     prepare_output_directory(out, allowed_entries=frozenset(entries))
     open_job_folder(out, job.to_dict())

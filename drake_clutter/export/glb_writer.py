@@ -10,11 +10,11 @@ import trimesh
 
 from drake_clutter.cell.support import Support
 from drake_clutter.export.model_parts import (
-    Y_UP_TO_Z_UP,
     classes_in_scene,
     load_visual,
     support_boxes,
 )
+from drake_clutter.mesh_file import Y_UP_TO_Z_UP
 from drake_clutter.scenes.scene import TRAY, Scene
 from drake_clutter.simulation.scene_plant import rigid_transform
 

@@ -17,13 +17,11 @@ from numpy.typing import NDArray
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.support import Support
 from drake_clutter.cell.support_sdf import support_sdf
+from drake_clutter.mesh_file import Y_UP_TO_Z_UP
 from drake_clutter.scenes.scene import Scene
 
 Floats = NDArray[np.float64]
 """An array of floats."""
-
-Y_UP_TO_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""Transform from a frame with y up (glTF) to one with z up. Shape (4, 4)."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +91,8 @@ def load_visual(object_class: ObjectClass) -> Any:
 
     It is a `trimesh.Trimesh` whose material is a `PBRMaterial` with the label as its texture.
     """
-    (mesh,) = trimesh.load_scene(object_class.folder / "visual.gltf").geometry.values()
+    parts = trimesh.load_scene(object_class.folder / "visual.gltf").geometry.values()
+    mesh = trimesh.util.concatenate(list(parts))  # packs the textures of several parts into one
     mesh.apply_transform(Y_UP_TO_Z_UP)
     return mesh
 

@@ -1,0 +1,157 @@
+"""Visual geometry of a user's mesh with the textures and colors of its file."""
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.sparse import csr_array
+
+from drake_clutter.assets.textured_mesh import TexturedMesh
+from drake_clutter.files import InputError
+from drake_clutter.mesh_file import MeshPart, ObjectMesh
+
+Floats = NDArray[np.float64]
+"""An array of floats."""
+
+MAX_TEXTURE_SIDE = 2048
+"""Largest side of a texture; larger ones are reduced [pixels].
+
+At the distance of the camera, a pixel of the image covers several of its pixels.
+"""
+_SMOOTH_ANGLE = np.radians(30)
+"""Faces whose normals differ by less are shaded as one smooth surface [rad]."""
+_COLOR_BITS = 6
+"""Bits of each channel of a vertex color: the palette has 512 x 512 pixels."""
+_PALETTE_SIDE = 2 ** (3 * _COLOR_BITS // 2)
+
+
+def has_appearance(mesh: ObjectMesh) -> bool:
+    """Return whether a mesh file has textures, materials or vertex colors."""
+    return any(part.visual.defined for part in mesh.parts if part.visual.kind is not None)
+
+
+def _corner_normals(points: Floats, triangles: NDArray[np.int64]) -> Floats:
+    """Return unit normals at the corners of triangles, smooth but for edges. Shape (F, 3, 3).
+
+    Args:
+        points: Vertices [m]. Shape (V, 3).
+        triangles: Vertex indices. Shape (F, 3).
+    """
+    # Vertices that are split at seams share their normals.
+    place = np.unique(points, axis=0, return_inverse=True)[1].reshape(-1)[triangles]
+    corners = points[triangles]
+    area_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.maximum(np.linalg.norm(area_normals, axis=1, keepdims=True), 1e-20)
+    normals = area_normals / lengths
+    face = np.repeat(np.arange(len(triangles)), 3)
+    at_place = csr_array((np.ones(len(face)), (place.reshape(-1), face)))
+    # Corners (rows) and the faces that meet at their place (columns).
+    meeting = at_place[place.reshape(-1)].tocoo()
+    row, other = meeting.coords
+    smooth = (normals[face[row]] * normals[other]).sum(axis=1) > np.cos(_SMOOTH_ANGLE)
+    total = np.zeros((len(face), 3))
+    np.add.at(total, row[smooth], area_normals[other[smooth]])
+    # A triangle without area has no normal; any unit vector will do.
+    total[np.linalg.norm(total, axis=1) < 1e-20] = [0.0, 0.0, 1.0]
+    unit = total / np.linalg.norm(total, axis=1, keepdims=True)
+    return np.asarray(unit.reshape(-1, 3, 3))
+
+
+def _check_obj_textures(path: Path) -> None:
+    """Raise an error if an OBJ file names a material file or a texture that is missing.
+
+    trimesh ignores missing textures.
+    """
+
+    def named_files(file: Path, keyword: str) -> list[Path]:
+        lines = (line.split() for line in file.read_text(errors="replace").splitlines())
+        return [file.parent / " ".join(w[1:]) for w in lines if len(w) > 1 and w[0] == keyword]
+
+    for materials in named_files(path, "mtllib"):
+        if not materials.is_file():
+            raise InputError(f"{path}: {materials.name} is missing; put it beside the mesh")
+        for texture in named_files(materials, "map_Kd"):
+            # A texture may have options before its name, which is the last word then.
+            if not texture.is_file() and not (path.parent / texture.name.split()[-1]).is_file():
+                raise InputError(f"{path}: texture {texture.name} is missing; put it beside it")
+
+
+def _material_image(material: Any) -> Image.Image | None:
+    """Return the color texture of a material, or None."""
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    if image is None:
+        return None
+    pixels: Image.Image = image.convert("RGB")
+    factor = getattr(material, "baseColorFactor", None)
+    if factor is not None:
+        scale = np.asarray(factor, float)[:3] / 255
+        pixels = Image.fromarray(np.asarray(np.asarray(pixels) * scale, np.uint8))
+    pixels.thumbnail((MAX_TEXTURE_SIDE, MAX_TEXTURE_SIDE), Image.Resampling.LANCZOS)
+    return pixels
+
+
+def _encode(image: Image.Image) -> bytes:
+    """Return an image as a PNG file with all its colors."""
+    buffer = io.BytesIO()
+    image.save(buffer, "PNG", optimize=True)
+    return buffer.getvalue()
+
+
+def _palette_uv(colors: NDArray[np.uint8]) -> tuple[Floats, Image.Image]:
+    """Return texture coordinates of colors (F, 3) in a palette, and the palette."""
+    levels = colors.astype(np.int64) >> (8 - _COLOR_BITS)
+    index = (levels << np.array([2 * _COLOR_BITS, _COLOR_BITS, 0])).sum(axis=1)
+    palette = np.zeros((_PALETTE_SIDE**2, 3), np.uint8)
+    palette[index] = colors
+    uv = np.column_stack([index % _PALETTE_SIDE, index // _PALETTE_SIDE])
+    image = Image.fromarray(palette.reshape(_PALETTE_SIDE, _PALETTE_SIDE, 3))
+    return (uv + 0.5) / _PALETTE_SIDE, image
+
+
+def _texture_part(part: MeshPart) -> tuple[TexturedMesh, bytes]:
+    """Return a part with its texture as a PNG file."""
+    visual = part.visual
+    uv = np.full((len(part.triangles), 3, 2), 0.5)
+    image: Image.Image | None = None
+    if visual.kind == "texture":
+        image = _material_image(visual.material)
+        if image is not None and visual.uv is not None:
+            # trimesh counts v from the lower edge, glTF from the upper one.
+            uv = np.asarray(visual.uv, float)[part.triangles] * [1, -1] + [0, 1]
+        else:
+            color = tuple(int(value) for value in visual.material.main_color[:3])
+            image = Image.new("RGB", (2, 2), color)
+    elif visual.kind in ("vertex", "face"):
+        if visual.kind == "vertex":
+            colors = np.asarray(visual.vertex_colors)[part.triangles, :3].mean(axis=1)
+        else:
+            colors = np.asarray(visual.face_colors)[part.triangle_ids, :3]
+        color_uv, image = _palette_uv(colors.astype(np.uint8))
+        uv = np.repeat(color_uv[:, None], 3, axis=1)
+    else:
+        image = Image.new("RGB", (2, 2), "#b0b7bf")
+    normals = _corner_normals(part.points, part.triangles)
+    vertices = np.concatenate([part.points[part.triangles], normals, uv], axis=2).reshape(-1, 8)
+    vertices, index = np.unique(np.round(vertices, 7), axis=0, return_inverse=True)
+    surface = TexturedMesh(
+        vertices[:, :3], vertices[:, 3:6], vertices[:, 6:], index.reshape(-1, 3).astype(np.int64)
+    )
+    return surface, _encode(image)
+
+
+def textured_parts(mesh: ObjectMesh, path: Path) -> list[tuple[TexturedMesh, bytes]]:
+    """Return the parts of a mesh and their textures as PNG files.
+
+    Args:
+        mesh: The mesh.
+        path: Its file.
+
+    Raises:
+        InputError: A texture or a material file is missing.
+    """
+    if path.suffix.lower() == ".obj":
+        _check_obj_textures(path)
+    return [_texture_part(part) for part in mesh.parts]

@@ -1,0 +1,186 @@
+"""Assets of users' meshes: what is written is what was in the file, and what is refused."""
+
+# trimesh is typed in part only.
+# mypy: allow-untyped-calls
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import rng, scene_of
+from numpy.typing import NDArray
+from PIL import Image
+from test_mesh_file import SIZE, write_cube_with_seams, write_two_materials
+from typer.testing import CliRunner
+
+from drake_clutter.assets import build_assets
+from drake_clutter.catalog import ObjectClass, load_catalog
+from drake_clutter.cli.app import app
+from drake_clutter.config import ClutterConfig
+from drake_clutter.export.model_parts import load_inertial, load_visual, write_class_meshes
+from drake_clutter.files import InputError
+from drake_clutter.scenes.scene import Pose, SceneObject
+from drake_clutter.simulation.camera_renderer import CameraRenderer
+from drake_clutter.simulation.drake_judge import DrakeJudge
+
+FACE_COLORS = np.array(
+    [[200, 30, 30], [30, 200, 30], [30, 30, 200], [200, 200, 30], [30, 200, 200], [200, 30, 200]]
+)
+"""Colors of the faces +x, -x, +y, -y, +z and -z (sRGB)."""
+
+
+def own_class(folder: Path, file_name: str, *, repair: bool = False) -> ObjectClass:
+    """Build the class of a mesh file in a folder, and return it."""
+    text = f"classes:\n  own: {{shape: mesh, mesh: {file_name}, mass_g: 200}}\n"
+    (folder / "catalog.yaml").write_text(text)
+    build_assets(folder, repair=repair)
+    return load_catalog(folder).classes["own"]
+
+
+def painted_box() -> trimesh.Trimesh:
+    """Return a box with a texture of six stripes, one for each face; split at its seams."""
+    box = trimesh.creation.box(SIZE)
+    axis = np.abs(box.face_normals).argmax(axis=1)
+    face = 2 * axis + (box.face_normals.sum(axis=1) < 0)
+    image = Image.fromarray(
+        np.repeat(np.repeat(FACE_COLORS, 8, axis=0)[:, None], 16, axis=1).astype(np.uint8)
+    )
+    # v counts from the lower edge in trimesh and OBJ; stripe i is the i-th from above.
+    v = 1 - (face + 0.5) / 6
+    uv = np.column_stack([np.full(36, 0.5), np.repeat(v, 3)])
+    split = trimesh.Trimesh(
+        box.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False
+    )
+    material = trimesh.visual.material.SimpleMaterial(image=image)
+    split.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    return split
+
+
+def vertex_colors(mesh: Any) -> NDArray[np.uint8]:
+    """Return the colors of the texture at the vertices."""
+    return np.asarray(mesh.visual.material.to_color(mesh.visual.uv))
+
+
+def seen_color(object_class: ObjectClass, R_TO: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the color in the center of the image of an object below the camera (sRGB)."""
+    scene = scene_of(SceneObject("own", object_class, Pose.from_rotation(R_TO, (0.0, 0.0, 0.05))))
+    image = np.asarray(CameraRenderer(ClutterConfig().cell.camera).render(scene).color)
+    row, column = image.shape[0] // 2, image.shape[1] // 2
+    center = image[row - 3 : row + 4, column - 3 : column + 4, :3]
+    return np.asarray(center.reshape(-1, 3).mean(axis=0), float)
+
+
+@pytest.mark.parametrize("name", ["box.obj", "box.glb"])
+def test_a_textured_model_looks_like_itself(tmp_path: Path, name: str) -> None:
+    """Each face has its color towards the camera, also in a glTF file, whose y axis is up."""
+    box = painted_box()
+    if name.endswith(".glb"):
+        box.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
+    box.export(tmp_path / name)
+    own = own_class(tmp_path, name)
+    assert own.size == pytest.approx(SIZE, abs=1e-6)
+    x, y, z = np.eye(3)
+    for stripe, rows in ((4, [x, y, z]), (5, [x, -y, -z]), (0, [-z, y, x]), (2, [x, -z, y])):
+        color = seen_color(own, np.array(rows))
+        # The light changes the brightness, but not which channels are strong.
+        strong = FACE_COLORS[stripe] > FACE_COLORS[stripe].mean()
+        assert np.array_equal(color > color.mean(), strong)
+
+
+def test_materials_without_textures_keep_their_colors(tmp_path: Path) -> None:
+    own = own_class(tmp_path, write_two_materials(tmp_path).name)
+    scene = trimesh.load_scene(own.folder / "visual.gltf")
+    colors = {
+        part.visual.material.baseColorTexture.convert("RGB").getpixel((0, 0))
+        for part in scene.geometry.values()
+    }
+    assert colors == {(255, 0, 0), (0, 0, 255)}
+    packed = load_visual(own)  # one mesh with one texture, for exports
+    assert len(packed.faces) == 12
+    assert {tuple(color[:3]) for color in vertex_colors(packed)} == colors
+    (tmp_path / "out").mkdir()
+    assert write_class_meshes(own, tmp_path / "out") == ["convex_000"]
+
+
+def test_vertex_colors_are_kept(tmp_path: Path) -> None:
+    box = trimesh.creation.box(SIZE)
+    box.visual.vertex_colors = np.tile([12, 200, 100, 255], (8, 1)).astype(np.uint8)
+    box.export(tmp_path / "box.ply")
+    colors = vertex_colors(load_visual(own_class(tmp_path, "box.ply")))
+    assert np.all(colors[:, :3] == [12, 200, 100])
+
+
+def test_a_missing_texture_is_refused(tmp_path: Path) -> None:
+    write_cube_with_seams(tmp_path)
+    (tmp_path / "label.png").unlink()
+    with pytest.raises(InputError, match=r"texture label\.png is missing"):
+        own_class(tmp_path, "cube.obj")
+
+
+def test_the_inertia_of_a_mesh_with_seams_is_that_of_a_box(tmp_path: Path) -> None:
+    own = own_class(tmp_path, write_cube_with_seams(tmp_path).name)
+    x, y, z = SIZE
+    moments = 0.2 / 12 * np.array([y * y + z * z, x * x + z * z, x * x + y * y])
+    inertial = load_inertial(own)
+    assert inertial.mass == 0.2
+    assert inertial.inertia[:3] == pytest.approx(moments, rel=1e-5)
+    assert inertial.inertia[3:] == pytest.approx(np.zeros(3), abs=1e-10)
+
+
+def test_two_bodies_of_which_one_is_inside_out_stand_in_drake(tmp_path: Path) -> None:
+    inverted = trimesh.creation.box(SIZE)
+    inverted.invert()
+    inverted.apply_translation([0, 0, 0.08])
+    box = trimesh.creation.box(SIZE)
+    trimesh.util.concatenate([box, inverted]).export(tmp_path / "two.stl")
+    own = own_class(tmp_path, "two.stl")
+    moments = np.sort(load_inertial(own).inertia[:3])
+    assert moments[2] <= moments[0] + moments[1]
+    assert len(own.convex_pieces) >= 2
+    pose = Pose.from_rotation(np.eye(3), (0.0, 0.0, own.size[2] / 2))
+    assert DrakeJudge(ClutterConfig()).judge(scene_of(SceneObject("own", own, pose)), rng(1)).stable
+
+
+def test_bodies_that_share_much_of_their_volume_are_refused(tmp_path: Path) -> None:
+    box = trimesh.creation.box(SIZE)
+    moved = box.copy()
+    moved.apply_translation([0.025, 0.001, 0.001])
+    trimesh.util.concatenate([box, moved]).export(tmp_path / "two.stl")
+    with pytest.raises(InputError, match=r"of its volume is covered twice, .* as at \("):
+        own_class(tmp_path, "two.stl")
+    assert not (tmp_path / "own").exists()
+
+
+def test_small_holes_are_closed_on_request(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.04)
+    hole = trimesh.triangles.area(ball.triangles).argmin()
+    faces = np.delete(ball.faces, hole, axis=0)
+    trimesh.Trimesh(ball.vertices, faces, process=False).export(tmp_path / "ball.stl")
+    text = "classes:\n  own: {shape: mesh, mesh: ball.stl, mass_g: 200}\n"
+    (tmp_path / "catalog.yaml").write_text(text)
+    with pytest.raises(InputError, match=r"hole of 3 edges.*assets build --repair"):
+        build_assets(tmp_path)
+    result = CliRunner().invoke(app, ["assets", "build", str(tmp_path), "--repair"])
+    assert result.exit_code == 0, result.output
+    assert "closed hole of 3 edges" in " ".join(result.output.split())
+    own = load_catalog(tmp_path).classes["own"]
+    assert load_inertial(own).inertia[0] == pytest.approx(0.4 * 0.2 * 0.04**2, rel=0.01)
+
+
+def test_assets_of_an_earlier_mesh_are_refused(tmp_path: Path) -> None:
+    trimesh.creation.box(SIZE).export(tmp_path / "box.stl")
+    own_class(tmp_path, "box.stl")
+    trimesh.creation.box(np.array(SIZE) * 1.5).export(tmp_path / "box.stl")
+    load_catalog.cache_clear()
+    with pytest.raises(InputError, match="was built from another mesh; run"):
+        _ = load_catalog(tmp_path).classes["own"].corners
+
+
+def test_a_damaged_model_is_refused(tmp_path: Path) -> None:
+    trimesh.creation.box(SIZE).export(tmp_path / "box.stl")
+    own = own_class(tmp_path, "box.stl")
+    own.sdf_path.write_text("<sdf><model>")
+    with pytest.raises(InputError, match=r"model\.sdf: cannot be read"):
+        _ = own.verified_sdf_path
