@@ -1,18 +1,26 @@
 """Suction gripper: seals, load ratios and accelerations, against analytical values."""
 
+# trimesh is typed in part only.
+# mypy: allow-untyped-calls
+
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from conftest import CLASSES, DEFAULT_CELL, resting
 from pydrake.math import RigidTransform, RotationMatrix
 
-from drake_clutter.catalog import RestOrientation, Shape, load_catalog
+from drake_clutter.assets import build_assets
+from drake_clutter.catalog import ObjectClass, RestOrientation, Shape, load_catalog
 from drake_clutter.cell.gripper import GraspFailure, GraspFailureReason, GraspSampling, Gripper
 from drake_clutter.cell.suction import (
     GRAVITY,
+    MAX_SEAL_GAP,
     SuctionGripper,
     lip_flatness_deviation,
+    lip_surface_profile,
     payload_wrench,
 )
 from drake_clutter.simulation.scene_plant import rigid_transform
@@ -162,3 +170,63 @@ def test_a_cup_attaches_where_the_surface_is_flat() -> None:
     can = CLASSES["tomato_soup_can"]
     assert CUP.can_attach(can, on_top(0.0505))
     assert not CUP.can_attach(can, on_top(0.0505, x=0.025))
+
+
+def own_class(folder: Path, mesh: trimesh.Trimesh) -> ObjectClass:
+    """Return a built class of a mesh."""
+    mesh.export(folder / "own.stl")
+    (folder / "catalog.yaml").write_text(
+        "classes:\n  own: {shape: mesh, mesh: own.stl, mass_g: 200}\n"
+    )
+    build_assets(folder)
+    return load_catalog(folder).classes["own"]
+
+
+def revolved(outline: list[tuple[float, float]]) -> trimesh.Trimesh:
+    """Return a solid of revolution of an outline of radii and heights [m]."""
+    return trimesh.creation.revolve(np.array(outline), sections=32)
+
+
+def test_the_profile_of_a_mesh_is_that_of_the_box_of_its_size(tmp_path: Path) -> None:
+    own = own_class(tmp_path, trimesh.creation.box((0.05, 0.06, 0.07)))
+    assert lip_flatness_deviation(own, on_top(0.035), CUP.cup_diameter) == pytest.approx(
+        0.0, abs=1e-9
+    )
+    assert lip_surface_profile(own, on_top(0.045), CUP.cup_diameter) == pytest.approx(
+        np.full(24, 0.010), abs=1e-7
+    )
+    tilted = lip_flatness_deviation(own, on_top(0.035, tilt=math.radians(5)), CUP.cup_diameter)
+    assert tilted == pytest.approx(CUP.cup_diameter * math.tan(math.radians(5)), rel=1e-5)
+    assert lip_flatness_deviation(own, on_top(0.035, x=0.02), CUP.cup_diameter) == math.inf
+
+
+def test_convex_pieces_that_bulge_over_a_flat_lid_do_not_break_the_seal(tmp_path: Path) -> None:
+    """A lid that lies below its rim is flat, though a convex piece rises 2 mm above its edge."""
+    rim = [(0, 0), (0.04, 0), (0.04, 0.06), (0.038, 0.06), (0.038, 0.057), (0, 0.057)]
+    own = own_class(tmp_path, revolved(rim))
+    for piece in own.folder.glob("convex_*.obj"):
+        piece.unlink()
+    bulge = revolved([(0, 0), (0.04, 0), (0.04, 0.06), (0.01, 0.058), (0, 0.057)]).convex_hull
+    bulge.apply_translation([0, 0, -0.03])
+    (own.folder / "convex_000.obj").write_text(bulge.export(file_type="obj"))
+    assert lip_flatness_deviation(own, on_top(0.03), CUP.cup_diameter) == pytest.approx(
+        0.0, abs=1e-6
+    )
+    grasps = CUP.sample_grasps(own, RigidTransform([0.0, 0.0, 0.03]), SAMPLING)
+    assert not isinstance(grasps, GraspFailure)
+    assert grasps[0].p_TG == pytest.approx([0.0, 0.0, 0.06], abs=1e-6)  # where the cup touches
+
+
+def test_every_grasp_on_a_mesh_is_one_that_the_simulation_attaches(tmp_path: Path) -> None:
+    """In a bowl the lip goes down to the floor, 30 mm below the rim."""
+    bowl = [(0, 0), (0.06, 0), (0.07, 0.036), (0.066, 0.036), (0.056, 0.006), (0, 0.006)]
+    own = own_class(tmp_path, revolved(bowl))
+    X_TO = RigidTransform([0.1, 0.0, 0.018])
+    grasps = CUP.sample_grasps(own, X_TO, SAMPLING)
+    assert not isinstance(grasps, GraspFailure)
+    for grasp in grasps:
+        X_TG = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), grasp.p_TG)
+        X_OG = X_TO.InvertAndCompose(X_TG)
+        assert CUP.can_attach(own, X_OG)
+        assert lip_surface_profile(own, X_OG, CUP.cup_diameter).min() <= MAX_SEAL_GAP
+        assert grasp.p_TG[2] == pytest.approx(0.006, abs=0.003)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial import ConvexHull
 
-from drake_clutter.catalog import ObjectClass
+from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.cell.epick import EPICK_LENGTH, EPICK_MASS, epick_sdf
 from drake_clutter.cell.gripper import (
     Grasp,
@@ -35,6 +35,8 @@ ATMOSPHERIC_PRESSURE = 101_325.0
 """Standard atmospheric pressure [Pa]."""
 GRAVITY = 9.81
 """Gravitational acceleration [m/s^2]."""
+MAX_SEAL_GAP = 0.005
+"""Largest lip-to-surface gap at which the vacuum can build up [m]."""
 _NUM_LIP_POINTS = 24
 """Number of points around the lip at which the surface is sampled."""
 _RAY_STANDOFF = 0.05
@@ -137,6 +139,15 @@ class SuctionGripper(StrictModel):
             min_deviation = min(min_deviation, deviation)
             if deviation > self.unevenness:
                 continue
+            if object_class.shape is Shape.MESH:
+                # The lip goes down until it touches a convex piece, which may bulge.
+                X_OG = X_TO.InvertAndCompose(X_TG)
+                contact_depth = _contact_depth(object_class, X_OG, self.cup_diameter)
+                gap = lip_surface_profile(object_class, X_OG, self.cup_diameter).min()
+                if gap - contact_depth > MAX_SEAL_GAP:
+                    min_deviation = max(min_deviation, gap - contact_depth)
+                    continue
+                X_TG = RigidTransform(_DOWNWARD_ROTATION, [x, y, upper[2] - contact_depth])
             p_GCm = X_TG.rotation().inverse() @ (X_TO.translation() - X_TG.translation())
             acceleration = self.max_acceleration(object_class.mass, p_GCm)
             if acceleration >= sampling.min_payload_acceleration:
@@ -214,23 +225,28 @@ def _piece_half_spaces(object_class: ObjectClass) -> tuple[Floats, ...]:
     return tuple(np.asarray(ConvexHull(piece).equations) for piece in object_class.convex_pieces)
 
 
-def lip_surface_profile(object_class: ObjectClass, X_OG: RigidTransform, diameter: float) -> Floats:
-    """Return the distance between lip and surface at points around the lip.
+def _ring_points(diameter: float) -> Floats:
+    """Return points of a circle in the plane of the lip [m]. Shape (24, 3)."""
+    angle = np.arange(_NUM_LIP_POINTS) * (2 * np.pi / _NUM_LIP_POINTS)
+    unit = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(_NUM_LIP_POINTS)])
+    return np.asarray(unit * diameter / 2)
+
+
+def _piece_depths(object_class: ObjectClass, X_OG: RigidTransform, points: Floats) -> Floats:
+    """Return the depth of the convex pieces below points of the lip.
 
     Args:
         object_class: Class of the object.
         X_OG: Pose of the gripper in the object.
-        diameter: Diameter of the lip [m].
+        points: Points in G [m]. Shape (n, 3).
 
     Returns:
-        Distances along z of G [m]; infinite where no surface is below. Shape (24,).
+        Distances along z of G [m]; infinite where no surface is below. Shape (n,).
     """
     R_OG = X_OG.rotation().matrix()
-    angle = np.arange(_NUM_LIP_POINTS) * (2 * np.pi / _NUM_LIP_POINTS)
-    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(_NUM_LIP_POINTS)]) * diameter / 2
-    starts = (ring - np.array([0.0, 0.0, _RAY_STANDOFF])) @ R_OG.T + X_OG.translation()
+    starts = (points - np.array([0.0, 0.0, _RAY_STANDOFF])) @ R_OG.T + X_OG.translation()
     direction = R_OG[:, 2]
-    depth = np.full(_NUM_LIP_POINTS, np.inf)
+    depth = np.full(len(points), np.inf)
     # Intersect each ray with the half-spaces of each convex piece.
     for half_spaces in _piece_half_spaces(object_class):
         slope = half_spaces[:, :3] @ direction
@@ -242,6 +258,49 @@ def lip_surface_profile(object_class: ObjectClass, X_OG: RigidTransform, diamete
         misses = (offset[:, np.abs(slope) <= 1e-9] > 0).any(axis=1)
         depth = np.where((entry <= leaving) & ~misses, np.minimum(depth, entry), depth)
     return depth - _RAY_STANDOFF
+
+
+def _mesh_depths(object_class: ObjectClass, X_OG: RigidTransform, points: Floats) -> Floats:
+    """Return the depth of a mesh below points of the lip, see `_piece_depths`."""
+    triangles = (object_class.surface_triangles - X_OG.translation()) @ X_OG.rotation().matrix()
+    near = (triangles[:, :, :2].min(axis=1) <= points[:, :2].max(axis=0)).all(axis=1) & (
+        triangles[:, :, :2].max(axis=1) >= points[:, :2].min(axis=0)
+    ).all(axis=1)
+    a, b, c = (triangles[near, corner] for corner in range(3))
+    side_b = b - a
+    side_c = c - a
+    area = side_b[:, 0] * side_c[:, 1] - side_b[:, 1] * side_c[:, 0]
+    arm_x = points[:, 0, None] - a[:, 0]
+    arm_y = points[:, 1, None] - a[:, 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weight_b = (arm_x * side_c[:, 1] - arm_y * side_c[:, 0]) / area
+        weight_c = (side_b[:, 0] * arm_y - side_b[:, 1] * arm_x) / area
+        depth = a[:, 2] + weight_b * side_b[:, 2] + weight_c * side_c[:, 2]
+        inside = (np.minimum(weight_b, weight_c) >= -1e-9) & (weight_b + weight_c <= 1 + 1e-9)
+    return np.asarray(np.where(inside, depth, np.inf).min(axis=1, initial=np.inf))
+
+
+def _contact_depth(object_class: ObjectClass, X_OG: RigidTransform, diameter: float) -> float:
+    """Return how far a cup moves along z of G until it touches a convex piece [m]."""
+    points = np.vstack([_ring_points(share * diameter) for share in (0.0, 0.5, 1.0)])
+    return float(_piece_depths(object_class, X_OG, points).min())
+
+
+def lip_surface_profile(object_class: ObjectClass, X_OG: RigidTransform, diameter: float) -> Floats:
+    """Return the distance between lip and surface at points around the lip.
+
+    The surface of a mesh is the mesh itself, as its convex pieces may bulge above a flat face.
+
+    Args:
+        object_class: Class of the object.
+        X_OG: Pose of the gripper in the object.
+        diameter: Diameter of the lip [m].
+
+    Returns:
+        Distances along z of G [m]; infinite where no surface is below. Shape (24,).
+    """
+    depths = _mesh_depths if object_class.shape is Shape.MESH else _piece_depths
+    return depths(object_class, X_OG, _ring_points(diameter))
 
 
 def lip_flatness_deviation(

@@ -13,7 +13,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
-from drake_clutter.cell.suction import lip_surface_profile
+from drake_clutter.cell.suction import MAX_SEAL_GAP, lip_surface_profile
 from drake_clutter.station.clutter_station import ClutterStation
 
 GRIPPER_UPDATE_PERIOD = 0.01
@@ -21,8 +21,6 @@ GRIPPER_UPDATE_PERIOD = 0.01
 OVERLOAD_RELEASE_TIME = 0.02
 """Duration of an overload after which the object comes off [s]: air leaks in. Shorter peaks come
 from contacts."""
-MAX_SEAL_GAP = 0.005
-"""Largest lip-to-surface gap at which the vacuum can build up [m]."""
 
 
 @dataclass(frozen=True)
