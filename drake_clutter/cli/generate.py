@@ -1,7 +1,7 @@
 """`drake-clutter generate`."""
 
 from collections.abc import Iterable
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -19,7 +19,7 @@ from drake_clutter.cli.options import (
     SetOption,
     WorkersOption,
 )
-from drake_clutter.cli.output import print_result, progress_bar
+from drake_clutter.cli.output import Item, print_result, progress_bar
 from drake_clutter.limits import MAX_COUNT
 
 
@@ -63,7 +63,7 @@ def generate(
     config = load_config_from_options(config_file, cell_file, settings)
     job = GenerationJob(agent, objects, catalog, nodes, seed, config, temperature)
 
-    def progress(scenes: Iterable[Any], num_done: int, total: int) -> Iterable[Any]:
+    def progress(scenes: Iterable[Item], num_done: int, total: int) -> Iterable[Item]:
         return progress_bar("scenes", scenes, num_done, total)
 
     summary = generate_scenes(job, count, out, workers, progress, ray)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import redirect_stdout, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rich.console import Console
 from rich.progress import (
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from drake_clutter.scenes.interfaces import MotionSample
     from drake_clutter.scenes.scene import Scene
     from drake_clutter.tasks.exploration_task import Transition
+
+Item = TypeVar("Item")
 
 out_console = Console()
 err_console = Console(stderr=True)
@@ -85,8 +87,8 @@ def print_episode(episode: Mapping[str, Any], as_json: bool, out: Path) -> None:
 
 
 def progress_bar(
-    description: str, items: Iterable[Any], num_done: int, total: int
-) -> Iterator[Any]:
+    description: str, items: Iterable[Item], num_done: int, total: int
+) -> Iterator[Item]:
     """Yield items while a progress bar on standard error counts them.
 
     Meanwhile standard output is redirected to standard error: Ray prints messages there, and

@@ -79,7 +79,7 @@ def generate_scenes(
     count: int,
     out: Path,
     workers: int,
-    progress: Callable[[Iterable[Any], int, int], Iterable[Any]],
+    progress: Callable[[Iterable[GeneratedScene], int, int], Iterable[GeneratedScene]],
     ray_address: str | None = None,
 ) -> dict[str, Any]:
     """Write `scenes/0000.yaml`, ..., `summary.json` and `contact_sheet.png`.
