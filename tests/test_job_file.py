@@ -42,6 +42,14 @@ def test_a_job_of_version_0_1_is_resumed(tmp_path: Path) -> None:
     open_job_folder(tmp_path, job())
 
 
+def test_a_study_of_version_0_1_is_refused(tmp_path: Path) -> None:
+    """Its setups are arms, not work cells."""
+    earlier = job() | {"setups": {"default": {"base": [-0.75, 0.0, 0.3], "payload": 10.0}}}
+    (tmp_path / JOB_FILE).write_text(json.dumps(earlier))
+    with pytest.raises(InputError, match=r"cannot be resumed.*give another folder"):
+        open_job_folder(tmp_path, job())
+
+
 def test_a_part_of_version_0_1_is_read(tmp_path: Path) -> None:
     path = tmp_path / "part.json"
     path.write_text(

@@ -17,6 +17,7 @@ from drake_clutter.agents.learned_generator import (
 )
 from drake_clutter.agents.replay_buffer import collate
 from drake_clutter.agents.soft_q import SoftQConfig
+from drake_clutter.commands.generate_scenes import generate_scenes
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import NodeBudget, canonical_form
@@ -86,6 +87,14 @@ def test_unknown_object_classes_are_rejected(checkpoint: Path) -> None:
         LearnedGenerator(checkpoint, ClutterConfig()).derive(
             GRAMMARS["pantry14"], NodeBudget(6), rng()
         )
+
+
+def test_a_refused_agent_leaves_no_output_folder(checkpoint: Path, tmp_path: Path) -> None:
+    job = GenerationJob(str(checkpoint), "pantry14", None, nodes=6, seed=1, config=ClutterConfig())
+    out = tmp_path / "scenes"
+    with pytest.raises(InputError, match="was not trained with"):
+        generate_scenes(job, 1, out, 1, lambda scenes, done, total: scenes)
+    assert not out.exists()
 
 
 def test_other_checkpoints_are_rejected(checkpoint: Path) -> None:

@@ -5,7 +5,7 @@ hill climber (HC).
 """
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -128,7 +128,10 @@ class HillClimber:
 
 
 def make_generation_agent(
-    name: str, config: ClutterConfig, temperature: float | None = None
+    name: str,
+    config: ClutterConfig,
+    temperature: float | None = None,
+    classes: Collection[str] = (),
 ) -> GenerationAgent:
     """Return a generation agent.
 
@@ -137,10 +140,12 @@ def make_generation_agent(
             checkpoint.
         config: Configuration of the simulated world.
         temperature: Temperature of a trained agent's softmax; None selects that of its checkpoint.
+        classes: Names of the object classes that will occur, as far as they are known.
 
     Raises:
-        InputError: The agent is unknown, the file is not a checkpoint of a scene generator, or a
-            temperature is given for an agent without one.
+        InputError: The agent is unknown, the file is not a checkpoint of a scene generator, a
+            temperature is given for an agent without one, or the agent was not trained with one of
+            the classes.
     """
     is_learned = name in PRETRAINED_GENERATORS or name.endswith(".safetensors")
     if temperature is not None and not (is_learned and temperature > 0):
@@ -161,7 +166,9 @@ def make_generation_agent(
     # Imported late: needs PyTorch, which is not required for the other agents.
     from drake_clutter.agents.learned_generator import LearnedGenerator
 
-    return LearnedGenerator(path, config, temperature)
+    agent = LearnedGenerator(path, config, temperature)
+    agent.require_classes(classes)
+    return agent
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Scene generator that samples grammar rules from a trained Q-network."""
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -160,6 +161,23 @@ class LearnedGenerator:
         self._judge = StaticStabilityJudge(config, margin=task.contact_margin)
         self._network: RuleQNetwork | None = None
 
+    def require_classes(self, classes: Collection[str]) -> None:
+        """Raise an error for a class that the agent was not trained with.
+
+        Args:
+            classes: Names of object classes.
+
+        Raises:
+            InputError: The agent was not trained with one of the classes.
+        """
+        trained_kinds = self._checkpoint.metadata["network"]["node_kinds"]
+        unknown = sorted(set(classes) - set(trained_kinds))
+        if unknown:
+            raise InputError(
+                f"--agent {self._path}: was not trained with {', '.join(unknown)}; "
+                "train one with your objects"
+            )
+
     def derive(
         self, grammar: SceneGrammar, budget: NodeBudget, rng: np.random.Generator
     ) -> Derivation:
@@ -171,13 +189,7 @@ class LearnedGenerator:
             InputError: The agent was not trained with an object class of the grammar.
         """
         if self._network is None:
-            trained_kinds = self._checkpoint.metadata["network"]["node_kinds"]
-            unknown = sorted(set(grammar.classes) - set(trained_kinds))
-            if unknown:
-                raise InputError(
-                    f"--agent {self._path}: was not trained with {', '.join(unknown)}; "
-                    "train one with your objects"
-                )
+            self.require_classes(grammar.classes)
             self._network = load_rule_network(self._checkpoint, grammar).eval()
         task = GenerationTaskConfig(nodes=budget.nodes, require_disassembly=False)
         partial = PartialScene(grammar, task, self._config, self._judge)

@@ -104,9 +104,11 @@ def generate_scenes(
     if count < 1:
         raise InputError(f"--count {count}; expected 1 or more")
     NodeBudget(job.nodes)
-    make_generation_agent(job.agent, job.config, job.temperature)
     catalog = load_catalog(job.catalog_folder)
-    for object_class in catalog.object_set(job.objects):
+    classes = catalog.object_set(job.objects)
+    names = [object_class.name for object_class in classes]
+    make_generation_agent(job.agent, job.config, job.temperature, names)
+    for object_class in classes:
         # These raise if a model is missing or disagrees, before anything is written.
         _ = object_class.verified_sdf_path
         _ = object_class.corners

@@ -36,8 +36,15 @@ def open_job_folder(out: Path, job: Mapping[str, Any]) -> None:
         prepare_output_directory(out)
         write_json(path, job)
         return
+    try:
+        earlier_job = _read_job(path)
+    except InputError as error:
+        raise InputError(
+            f"--out {out}: cannot be resumed, because its {JOB_FILE} is not one of this version "
+            f"({error}); give another folder"
+        ) from error
     # Compared as text, because the order of cameras matters, too.
-    if json.dumps(_read_job(path)) != json.dumps(job):
+    if json.dumps(earlier_job) != json.dumps(job):
         raise InputError(
             f"--out {out}: holds results of other options, see {JOB_FILE}; give the same options "
             "or another folder"

@@ -21,7 +21,7 @@ def checkpoint_path(name: str, pretrained: Mapping[str, str]) -> Path:
     missing = [module for module in ("torch", "safetensors") if find_spec(module) is None]
     if missing:
         raise InputError(
-            f"--agent {name}: needs {' and '.join(missing)}; install drake_clutter with [train]"
+            f"--agent {name}: needs {' and '.join(missing)}; install drake_clutter with [learned]"
         )
     try:
         return resource_path(pretrained[name]) if name in pretrained else Path(name)
