@@ -52,7 +52,8 @@ def _section(name: str, command: Any, context: Any) -> str:
             declaration, text = record
             facts = _FACTS.search(text)
             meaning = text[: facts.start()] if facts else text
-            rows.append([f"`{_cell(declaration)}`", _cell(meaning), facts[1] if facts else ""])
+            code = " ".join(declaration.split())  # a "|" in code does not separate columns
+            rows.append([f"`{code}`", _cell(meaning), facts[1] if facts else ""])
     heading = f"\n## {name}\n\n{command.help}\n\n```text\n{usage}\n```\n\n"
     return heading + table(["parameter", "meaning", "default, range"], rows)
 
