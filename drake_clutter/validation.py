@@ -203,6 +203,10 @@ def _json_schema(schema: Any) -> dict[str, Any]:
     return _adapter(schema).json_schema()
 
 
+_UNKNOWN_FIELD = ("extra_forbidden", "unexpected_keyword_argument", "invalid_key")
+"""Types of pydantic's errors about a field that a schema does not have."""
+
+
 def validate(schema: type[Schema], document: Any, source: str) -> Schema:
     """Return a document as an instance of a schema.
 
@@ -217,9 +221,11 @@ def validate(schema: type[Schema], document: Any, source: str) -> Schema:
     try:
         validated: Schema = _adapter(cast(Hashable, schema)).validate_python(document)
     except ValidationError as error:
-        raise input_error(
-            source, _error_message(schema, error.errors(include_url=False)[0])
-        ) from None
+        # Unknown fields come first: a misspelled field is reported, rather than as a missing one.
+        errors = sorted(
+            error.errors(include_url=False), key=lambda found: found["type"] not in _UNKNOWN_FIELD
+        )
+        raise input_error(source, _error_message(schema, errors[0])) from None
     return validated
 
 
@@ -227,7 +233,7 @@ def _error_message(schema: Any, error: ErrorDetails) -> str:
     """Return field, value and what is allowed, from a pydantic error."""
     error_type = error["type"]
     location = error["loc"]
-    if error_type in ("extra_forbidden", "unexpected_keyword_argument", "invalid_key"):
+    if error_type in _UNKNOWN_FIELD:
         owner, node = _locate(schema, location[:-1])
         names = ", ".join(node.get("properties", {}))
         return f"{_field_path(owner, location[-1])}: is unknown; expected {names}"

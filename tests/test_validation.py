@@ -109,6 +109,7 @@ REFUSED = [
     ("tool: {kind: hook}", "tool.kind: 'hook'; expected one of cup, jaws"),
     ("tool: {kind: [hook]}", "tool.kind: ['hook']; expected one of cup, jaws"),
     ("tool: {kind: jaws}", "tool.width: is missing; needed are width"),
+    ("tool: {kind: jaws, span: 0.1}", "tool.span: is unknown; expected kind, width"),
     ("tool: {kind: jaws, width: 1}", "tool.width: 1; expected a finite number from 0.01 to 0.2"),
     ("tool: {radius: 1, color: 2}", "tool.color: is unknown; expected kind, radius, rims"),
     ("tool: {rims: [[1, 2, 3], [1, 2]]}", "tool.rims[1]: [1, 2]; expected a list of 3 numbers"),
