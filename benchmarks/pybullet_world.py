@@ -1,30 +1,26 @@
-"""Scenes in PyBullet, for the comparison with Drake in `judge_speed.py`."""
+"""Scenes in PyBullet, for the benchmarks that compare it with Drake."""
 
-import math
 from pathlib import Path
 from typing import Any
 
 import pybullet
 
 from drake_clutter.cell.work_cell import default_cell
+from drake_clutter.export.sdf_writer import PYBULLET_FILE
 from drake_clutter.scenes.scene import Pose, Scene
 
 TIME_STEP = 1 / 240
 """Time step of the simulation, PyBullet's default [s]."""
-FRICTION = 0.5
-"""Coefficient of friction between any two bodies."""
 
 
 def load_world(path: Path) -> None:
     """Create a world from an exported scene.
 
     Args:
-        path: SDF file of the scene.
+        path: SDF file of the scene; the file for PyBullet beside it is loaded.
     """
     pybullet.connect(pybullet.DIRECT)
-    for body in pybullet.loadSDF(str(path)):
-        # PyBullet multiplies the coefficients of two bodies in contact.
-        pybullet.changeDynamics(body, -1, lateralFriction=math.sqrt(FRICTION))
+    pybullet.loadSDF(str(path.with_name(PYBULLET_FILE)))
     pybullet.setGravity(0, 0, -9.81)
     pybullet.setTimeStep(TIME_STEP)
 

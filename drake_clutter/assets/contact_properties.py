@@ -1,4 +1,4 @@
-"""Contact properties of everything that is simulated in Drake."""
+"""Contact properties of everything that is simulated, in Drake or elsewhere."""
 
 HYDROELASTIC_MODULUS = 1e8
 """Hydroelastic modulus [Pa].
@@ -9,6 +9,13 @@ DISSIPATION = 10.0
 """Hunt-Crossley dissipation, with which objects settle without bouncing [s/m]."""
 SURFACE_FRICTION = 0.5
 """Coulomb coefficient of every surface, static and dynamic."""
+ROLLING_FRICTION = 1e-3
+"""Coefficient of rolling friction of exported objects that can roll [m].
+
+The largest moment of a contact against rolling is this length times the normal force: an object of
+radius r rests on slopes of up to `ROLLING_FRICTION` / r. A real marker rests on steeper ones because
+of its clip. Drake has no rolling friction; there, damping stops lying cylinders.
+"""
 
 
 def proximity_properties_sdf(resolution_hint: float, *, compliant: bool) -> str:

@@ -4,10 +4,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
-from drake_clutter.assets.contact_properties import SURFACE_FRICTION
+from drake_clutter.assets.contact_properties import ROLLING_FRICTION, SURFACE_FRICTION
 from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.cell.support import Support
 from drake_clutter.export.model_parts import (
+    can_roll,
     classes_in_scene,
     format_numbers,
     load_inertial,
@@ -17,9 +18,26 @@ from drake_clutter.export.model_parts import (
 )
 from drake_clutter.scenes.scene import TRAY, Scene, SceneObject
 
+_TORSIONAL_FRICTION = 0.005
+"""MuJoCo's default coefficient of torsional friction [m]."""
+_DEFAULT_ROLLING_FRICTION = 1e-4
+"""MuJoCo's default coefficient of rolling friction [m], which acts on contacts of condim 6 only."""
+_TIME_STEP = 0.002
+"""Time step of the simulation, MuJoCo's default [s]."""
+_CONTACT_TIME_CONSTANT = 2 * _TIME_STEP
+"""Time constant of the contacts [s]: the stiffest that MuJoCo allows with this time step.
+
+Under MuJoCo's default of 0.02 s, tall stacks on two lying markers lean and fall.
+"""
+_FRICTION_IMPEDANCE_RATIO = 100.0
+"""How much harder contacts are along the surface than along the normal, see `impratio`.
+
+With MuJoCo's default of 1, the objects of a stack creep sideways until it falls.
+"""
+
 
 def _add_defaults(root: Element) -> None:
-    """Add the default classes of visual and collision geometry."""
+    """Add the default classes of visual, collision and rolling collision geometry."""
     default = SubElement(root, "default")
     # Masses come from the inertials. The shell inertia avoids an error for meshes that are not
     # closed.
@@ -27,11 +45,21 @@ def _add_defaults(root: Element) -> None:
     visual = SubElement(default, "default", {"class": "visual"})
     SubElement(visual, "geom", type="mesh", group="2", contype="0", conaffinity="0")
     collision = SubElement(default, "default", {"class": "collision"})
-    # The torsional and rolling coefficients are MuJoCo's defaults. A contact gets the larger
-    # friction of its two geoms.
+    # A contact gets the larger friction and the larger condim of its two geoms.
     SubElement(
-        collision, "geom", group="3", friction=format_numbers([SURFACE_FRICTION, 0.005, 0.0001])
+        collision,
+        "geom",
+        group="3",
+        friction=_friction(_DEFAULT_ROLLING_FRICTION),
+        solref=format_numbers([_CONTACT_TIME_CONSTANT, 1.0]),
     )
+    rolling = SubElement(collision, "default", {"class": "rolling_collision"})
+    SubElement(rolling, "geom", condim="6", friction=_friction(ROLLING_FRICTION))
+
+
+def _friction(rolling: float) -> str:
+    """Return MuJoCo's sliding, torsional and rolling coefficients."""
+    return format_numbers([SURFACE_FRICTION, _TORSIONAL_FRICTION, rolling])
 
 
 def _add_assets(asset: Element, object_class: ObjectClass, pieces: Sequence[str]) -> None:
@@ -91,8 +119,9 @@ def _add_object(worldbody: Element, scene_object: SceneObject, pieces: Sequence[
         geometries = [{"type": "cylinder", "size": format_numbers([x / 2, z / 2])}]
     else:
         geometries = [{"type": "mesh", "mesh": f"{object_class.name}/{piece}"} for piece in pieces]
+    collision = "rolling_collision" if can_roll(object_class) else "collision"
     for geometry in geometries:
-        SubElement(body, "geom", {"class": "collision"} | geometry)
+        SubElement(body, "geom", {"class": collision} | geometry)
 
 
 def write_mjcf(scene: Scene, folder: Path) -> Path:
@@ -102,6 +131,15 @@ def write_mjcf(scene: Scene, folder: Path) -> Path:
     """
     root = Element("mujoco", model="scene")
     SubElement(root, "compiler", angle="radian", inertiafromgeom="false")
+    option = SubElement(
+        root,
+        "option",
+        timestep=repr(_TIME_STEP),
+        cone="elliptic",
+        impratio=repr(_FRICTION_IMPEDANCE_RATIO),
+    )
+    # Flat faces need several contact points; earlier versions of MuJoCo find one by default.
+    SubElement(option, "flag", multiccd="enable")
     _add_defaults(root)
     asset = SubElement(root, "asset")
     pieces: Mapping[str, Sequence[str]] = {

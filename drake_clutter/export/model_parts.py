@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from drake_clutter.catalog import ObjectClass
+from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.cell.support import Support
 from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.mesh_file import Y_UP_TO_Z_UP
@@ -61,6 +61,11 @@ def classes_in_scene(scene: Scene) -> list[ObjectClass]:
     return sorted(
         {scene_object.object_class for scene_object in scene.objects}, key=lambda entry: entry.name
     )
+
+
+def can_roll(object_class: ObjectClass) -> bool:
+    """Return whether objects of a class may roll: cylinders, and meshes, which may be round."""
+    return object_class.shape is not Shape.BOX
 
 
 def format_numbers(numbers: Iterable[float]) -> str:

@@ -1,12 +1,15 @@
 """Export of a scene as an SDFormat world, for PyBullet, Gazebo and Drake."""
 
+import math
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 from pydrake.math import RollPitchYaw
 
+from drake_clutter.assets.contact_properties import ROLLING_FRICTION, SURFACE_FRICTION
 from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.export.model_parts import (
+    can_roll,
     classes_in_scene,
     format_numbers,
     write_class_meshes,
@@ -16,31 +19,64 @@ from drake_clutter.scenes.scene import TRAY, Pose, Scene
 from drake_clutter.simulation.scene_plant import rigid_transform
 
 _DRAKE = "drake.mit.edu"
+PYBULLET_FILE = "scene_pybullet.sdf"
+"""Name of the file for PyBullet.
+
+PyBullet reads friction from an element of its own only, which strict readers of SDFormat reject.
+"""
 
 
-def _use_standard_friction(collision: ElementTree.Element) -> None:
-    """Replace Drake's friction element by the standard one.
+def _use_standard_friction(collision: ElementTree.Element, rolling_friction: float) -> None:
+    """Replace Drake's friction element by the standard ones.
 
-    Drake reads the standard element, too, but does not allow both.
+    Drake reads the standard element, too, but does not allow both. SDFormat has rolling friction in
+    the element of the Bullet engine only.
+
+    Args:
+        collision: Element of a collision geometry, which is changed.
+        rolling_friction: Coefficient of rolling friction [m]; 0: none.
     """
     properties = collision.find(f"{{{_DRAKE}}}proximity_properties")
     assert properties is not None
     surface = ElementTree.SubElement(collision, "surface")
-    ode = ElementTree.SubElement(ElementTree.SubElement(surface, "friction"), "ode")
+    friction = ElementTree.SubElement(surface, "friction")
+    ode = ElementTree.SubElement(friction, "ode")
     for drake_name, name in (("mu_static", "mu"), ("mu_dynamic", "mu2")):
         element = properties.find(f"{{{_DRAKE}}}{drake_name}")
         assert element is not None
         properties.remove(element)
         ElementTree.SubElement(ode, name).text = element.text
+    if rolling_friction:
+        bullet = ElementTree.SubElement(friction, "bullet")
+        ElementTree.SubElement(bullet, "friction").text = repr(SURFACE_FRICTION)
+        ElementTree.SubElement(bullet, "friction2").text = repr(SURFACE_FRICTION)
+        ElementTree.SubElement(bullet, "rolling_friction").text = repr(rolling_friction)
 
 
-def _model(text: str, name: str) -> ElementTree.Element:
+def _add_pybullet_friction(model: ElementTree.Element) -> None:
+    """Add the element from which PyBullet reads friction to a model.
+
+    PyBullet multiplies the friction of two bodies, and the rolling friction of each by the friction
+    of the other. The coefficients are such that the results are those of the other formats.
+    """
+    link = model.find("link")
+    assert link is not None
+    contact = ElementTree.SubElement(link, "contact")
+    friction = math.sqrt(SURFACE_FRICTION)
+    ElementTree.SubElement(contact, "lateral_friction").text = repr(friction)
+    rolling_friction = link.findtext("collision/surface/friction/bullet/rolling_friction")
+    if rolling_friction is not None:
+        scaled = float(rolling_friction) / friction
+        ElementTree.SubElement(contact, "rolling_friction").text = repr(scaled)
+
+
+def _model(text: str, name: str, rolling_friction: float = 0.0) -> ElementTree.Element:
     """Return the model of an SDF document under another name, with standard friction."""
     model = ElementTree.fromstring(text).find("model")
     assert model is not None
     model.set("name", name)
     for collision in model.iter("collision"):
-        _use_standard_friction(collision)
+        _use_standard_friction(collision, rolling_friction)
     return model
 
 
@@ -51,9 +87,10 @@ def _pose_text(pose: Pose) -> str:
 
 
 def write_sdf(scene: Scene, folder: Path) -> Path:
-    """Write `scene.sdf`, a world with one model per object, and meshes per class.
+    """Write a world with one model per object, and meshes per class.
 
-    Returns the path of `scene.sdf`.
+    `scene_pybullet.sdf` is `scene.sdf` with friction as PyBullet reads it. Returns the path of
+    `scene.sdf`.
     """
     # Without this, the prefix would be renamed, and Drake would not recognize it.
     ElementTree.register_namespace("drake", _DRAKE)
@@ -68,9 +105,9 @@ def write_sdf(scene: Scene, folder: Path) -> Path:
     world.append(tray)
     for scene_object in scene.objects:
         object_class = scene_object.object_class
-        model = _model(
-            object_class.verified_sdf_path.read_text(encoding="utf-8"), scene_object.name
-        )
+        text = object_class.verified_sdf_path.read_text(encoding="utf-8")
+        rolling_friction = ROLLING_FRICTION if can_roll(object_class) else 0.0
+        model = _model(text, scene_object.name, rolling_friction)
         for uri in model.iter("uri"):
             # PyBullet reads no glTF.
             uri.text = f"{object_class.name}/{uri.text}".replace(".gltf", ".obj")
@@ -80,4 +117,7 @@ def write_sdf(scene: Scene, folder: Path) -> Path:
         world.append(model)
     path = folder / "scene.sdf"
     write_xml(path, root)
+    for model in world.iter("model"):
+        _add_pybullet_friction(model)
+    write_xml(folder / PYBULLET_FILE, root)
     return path
