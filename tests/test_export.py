@@ -2,7 +2,7 @@
 
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import numpy as np
 import pybullet
 import pytest
 import trimesh
-from conftest import resting, scene_of
+from conftest import CATALOG, resting, scene_of
 from numpy.typing import NDArray
 from PIL import Image
 from pydrake.multibody.parsing import Parser
@@ -19,15 +19,20 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation
 
+from benchmarks.exported_stability import MAX_DISPLACEMENT, simulate_mujoco, simulate_pybullet
 from drake_clutter.assets import build_assets
-from drake_clutter.assets.contact_properties import SURFACE_FRICTION
-from drake_clutter.catalog import ObjectClass, load_catalog
+from drake_clutter.assets.contact_properties import ROLLING_FRICTION, SURFACE_FRICTION
+from drake_clutter.catalog import ObjectClass, Shape, load_catalog
+from drake_clutter.config import ClutterConfig
 from drake_clutter.export import ExportFormat, export_scene
 from drake_clutter.export.model_parts import load_inertial, load_visual
+from drake_clutter.export.sdf_writer import PYBULLET_FILE
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
+from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.simulation.scene_plant import rigid_transform
+from training.script import SCENES
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "custom_class"
 MAIN_FILES = {
@@ -135,7 +140,7 @@ def bullet() -> Iterator[int]:
 
 
 def check_in_pybullet(scene: Scene, main_file: Path, client: int) -> None:
-    bodies = pybullet.loadSDF(str(main_file), physicsClientId=client)
+    bodies = pybullet.loadSDF(str(main_file.with_name(PYBULLET_FILE)), physicsClientId=client)
     names = [pybullet.getBodyInfo(body, physicsClientId=client)[1].decode() for body in bodies]
     assert names == ["tray", *scene.names]
     assert pybullet.getDynamicsInfo(bodies[0], -1, physicsClientId=client)[0] == 0  # it is static
@@ -148,6 +153,10 @@ def check_in_pybullet(scene: Scene, main_file: Path, client: int) -> None:
         ):
             X[:3, :3], X[:3, 3] = Rotation.from_quat(q).as_matrix(), p
         check(scene, name, dynamics[0], X_TI @ np.linalg.inv(X_OI), BULLET)
+        # PyBullet multiplies friction, and rolling friction by the other body's friction.
+        can_roll = scene[name].object_class.shape is not Shape.BOX
+        assert dynamics[1] ** 2 == pytest.approx(SURFACE_FRICTION)
+        assert dynamics[6] * dynamics[1] == pytest.approx(ROLLING_FRICTION if can_roll else 0)
         (visual,) = pybullet.getVisualShapeData(
             body, pybullet.VISUAL_SHAPE_DATA_TEXTURE_UNIQUE_IDS, physicsClientId=client
         )
@@ -189,6 +198,9 @@ def check_in_mujoco(scene: Scene, main_file: Path) -> None:
         assert model.mat_texid[visuals[0].matid[0]].max() >= 0
         assert len(contacts) == len(scene[name].object_class.convex_pieces)
         assert all(geom.friction[0] == SURFACE_FRICTION for geom in contacts)
+        if scene[name].object_class.shape is not Shape.BOX:
+            assert all(geom.condim[0] == 6 for geom in contacts)
+            assert all(geom.friction[2] == ROLLING_FRICTION for geom in contacts)
     for name in scene.names:
         inertial = load_inertial(scene[name].object_class)
         xx, yy, zz, xy, xz, yz = inertial.inertia
@@ -264,6 +276,17 @@ def test_textures_are_the_labels(exported: tuple[ExportFormat, Path], scene: Sce
             with Image.open(main_file.parent / object_class.name / "label.png") as picture:
                 label = load_visual(object_class).visual.material.baseColorTexture.convert("RGB")
                 assert np.array_equal(np.asarray(picture), np.asarray(label))
+
+
+@pytest.mark.parametrize("simulate", [simulate_mujoco, simulate_pybullet])
+@pytest.mark.parametrize(("dataset_name", "index"), [("rg_25", 1), ("sg_star_25", 1), ("sg_14", 0)])
+def test_stable_scenes_stay_at_rest(
+    simulate: Callable[[Scene, float], float], dataset_name: str, index: int
+) -> None:
+    """The scenes have lying markers that roll away without rolling friction, and stacks on them."""
+    dataset = load_scene_dataset(SCENES / f"{dataset_name}.json", CATALOG)
+    scene = dataset.settled_scene(index, dataset.grammar, ClutterConfig())
+    assert simulate(scene, 4.0) <= MAX_DISPLACEMENT
 
 
 @pytest.mark.parametrize(

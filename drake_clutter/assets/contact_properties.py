@@ -12,9 +12,9 @@ SURFACE_FRICTION = 0.5
 ROLLING_FRICTION = 1e-3
 """Coefficient of rolling friction of exported objects that can roll [m].
 
-The largest moment of a contact against rolling is this length times the normal force: an object of
-radius r rests on slopes of up to `ROLLING_FRICTION` / r. A real marker rests on steeper ones because
-of its clip. Drake has no rolling friction; there, damping stops lying cylinders.
+A contact resists rolling with moments of up to this length times the normal force: an object of
+radius r rests on slopes of up to `ROLLING_FRICTION` / r. A real marker rests on steeper ones, as it
+has a clip. Drake has no rolling friction; there, damping stops lying cylinders.
 """
 
 
