@@ -1,19 +1,28 @@
 """Datasets of labeled images, and the noise of a stereo camera."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from conftest import CLASSES, DEFAULT_CELL, TRAY, resting, rng, scene_of, training_script
 from numpy.typing import NDArray
+from PIL import Image
+from pycocotools.coco import COCO
+from pycocotools.cocoeval import COCOeval
 
+from drake_clutter.catalog import Shape
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
+from drake_clutter.perception.bop_models import write_dataset_camera, write_models
 from drake_clutter.perception.depth_noise import D435_DEPTH_NOISE, DepthNoise, add_depth_noise
 from drake_clutter.perception.image_dataset import (
+    TRAIN_FOLDER,
+    AnnotatedImage,
     ImageDataset,
-    LabeledImage,
+    encode_depth,
     encode_run_lengths,
     write_images,
 )
@@ -36,9 +45,9 @@ def decode_run_lengths(counts: list[int], shape: tuple[int, int]) -> NDArray[np.
 
 
 @pytest.fixture(scope="module")
-def images(camera: CameraRenderer) -> list[LabeledImage]:
+def images(camera: CameraRenderer) -> list[AnnotatedImage]:
     """Return images of the scene with and without the upper box."""
-    known: dict[SceneObject, int] = {}
+    known: dict[SceneObject, NDArray[np.bool_]] = {}
     render_image = training_script("render_image_dataset").render_image
     generator = rng()
     scenes = (SCENE, scene_of(*(o for o in SCENE.objects if o.name != "over")))
@@ -91,13 +100,17 @@ def test_holes_are_shadows_and_speckles() -> None:
     assert np.array_equal(add_depth_noise(depth, rng(1)), add_depth_noise(depth, rng(1)))
 
 
-def test_images_are_read_as_they_were_written(tmp_path: Path, images: list[LabeledImage]) -> None:
-    (tmp_path / ".000000").mkdir()  # Left by an interrupted run.
-    write_images(tmp_path / "000000", images, DEFAULT_CELL.camera, list(CLASSES))
-    assert [path.name for path in tmp_path.iterdir()] == ["000000"]
+@pytest.mark.parametrize("split", [TRAIN_FOLDER, "."], ids=["today", "version 0.1"])
+def test_images_are_read_as_they_were_written(
+    tmp_path: Path, images: list[AnnotatedImage], split: str
+) -> None:
+    folder = tmp_path / split
+    (folder / ".000000").mkdir(parents=True)  # Left by an interrupted run.
+    write_images(folder / "000000", images, DEFAULT_CELL.camera, list(CLASSES))
+    assert [path.name for path in folder.iterdir()] == ["000000"]
     read = ImageDataset(tmp_path)
     assert len(read) == 2
-    for written, again in zip(images, (read[0], read[1]), strict=True):
+    for written, again in zip((a.image for a in images), (read[0], read[1]), strict=True):
         assert np.array_equal(written.color, again.color)
         assert np.array_equal(np.isinf(written.depth), np.isinf(again.depth))
         assert np.allclose(written.depth, again.depth, rtol=0, atol=0.51e-4)
@@ -110,18 +123,31 @@ def test_images_are_read_as_they_were_written(tmp_path: Path, images: list[Label
     assert read[0].visible_fractions == pytest.approx([0, 1, 1, 1])
     assert read[1].visible_fractions == pytest.approx([1, 1, 1])
     with pytest.raises(InputError, match="holds no images"):
-        ImageDataset(tmp_path / "000000")
+        ImageDataset(folder / "000000")
 
 
 def test_visible_fractions_are_those_of_the_renderer(
-    camera: CameraRenderer, images: list[LabeledImage]
+    camera: CameraRenderer, images: list[AnnotatedImage]
 ) -> None:
     assert dict(
-        zip(SCENE.names, images[0].visible_fractions, strict=True)
+        zip(SCENE.names, images[0].image.visible_fractions, strict=True)
     ) == camera.visible_fractions(SCENE)
 
 
-def test_files_conform_to_bop_and_coco(tmp_path: Path, images: list[LabeledImage]) -> None:
+def test_depth_beyond_16_bits_is_unknown() -> None:
+    depth = np.array([0.5, 6.5535, 6.5536, 10.0, np.inf, np.nan], np.float64)
+    assert encode_depth(depth).tolist() == [5000, 65535, 0, 0, 0, 0]
+
+
+def test_too_many_instances_are_refused(tmp_path: Path, images: list[AnnotatedImage]) -> None:
+    image = replace(images[0].image, classes=("sugar_box",) * 256)
+    with pytest.raises(InputError, match="an image of 256 instances; allowed are at most 255"):
+        write_images(
+            tmp_path / "0", [replace(images[0], image=image)], DEFAULT_CELL.camera, list(CLASSES)
+        )
+
+
+def test_files_conform_to_bop_and_coco(tmp_path: Path, images: list[AnnotatedImage]) -> None:
     write_images(tmp_path / "000000", images, DEFAULT_CELL.camera, list(CLASSES))
     gt, info, camera_entries, coco = (
         json.loads((tmp_path / "000000" / f"scene_{name}.json").read_text())
@@ -130,29 +156,124 @@ def test_files_conform_to_bop_and_coco(tmp_path: Path, images: list[LabeledImage
     names = {category["id"]: category["name"] for category in coco["categories"]}
     K = np.reshape(camera_entries["0"]["cam_K"], (3, 3))
     for number, instance in enumerate(gt["0"]):
-        assert names[instance["obj_id"]] == images[0].classes[number]
+        assert names[instance["obj_id"]] == images[0].image.classes[number]
         R_CO, p_CO = np.reshape(instance["cam_R_m2c"], (3, 3)), np.array(instance["cam_t_m2c"])
-        corners = CLASSES[images[0].classes[number]].corners * 1000 @ R_CO.T + p_CO
+        corners = CLASSES[images[0].image.classes[number]].corners * 1000 @ R_CO.T + p_CO
         pixels = (corners @ K.T / corners[:, 2:])[:, :2]
-        if info["0"][number]["px_count_visib"]:
-            x, y, width, height = info["0"][number]["bbox_visib"]
+        kinds = ("bbox_obj", "bbox_visib") if info["0"][number]["px_count_visib"] else ("bbox_obj",)
+        for kind in kinds:
+            x, y, width, height = info["0"][number][kind]
             lower, upper = pixels.min(axis=0), pixels.max(axis=0)
             assert [x, y, x + width - 1, y + height - 1] == pytest.approx([*lower, *upper], abs=1.0)
-    assert info["0"][0] == {
-        "px_count_all": info["1"][0]["px_count_all"],
+    alone = info["1"][0]
+    assert alone["px_count_visib"] == alone["px_count_valid"] == alone["px_count_all"]
+    assert info["0"][0] == alone | {
         "px_count_visib": 0,
         "visib_fract": 0.0,
-    } | {"bbox_visib": [-1, -1, -1, -1]}
+        "bbox_visib": [-1, -1, -1, -1],
+    }
     annotated = [a for a in coco["annotations"] if a["image_id"] == 0]
-    assert [names[a["category_id"]] for a in annotated] == list(images[0].classes[1:]), (
+    assert [names[a["category_id"]] for a in annotated] == list(images[0].image.classes[1:]), (
         "the hidden instance has no mask"
     )
     for instance, annotation in enumerate(annotated, start=1):
         mask = decode_run_lengths(
             annotation["segmentation"]["counts"], annotation["segmentation"]["size"]
         )
-        assert np.array_equal(mask, images[0].label == instance)
+        assert np.array_equal(mask, images[0].image.label == instance)
         assert annotation["area"] == mask.sum()
+
+
+def test_pycocotools_evaluates_detections(tmp_path: Path, images: list[AnnotatedImage]) -> None:
+    """The annotations, taken as detections, have an average precision of 1."""
+    write_images(tmp_path / "000000", images, DEFAULT_CELL.camera, list(CLASSES))
+    truth = COCO(str(tmp_path / "000000" / "scene_gt_coco.json"))
+    detections = [
+        {
+            "image_id": annotation["image_id"],
+            "category_id": annotation["category_id"],
+            "segmentation": truth.annToRLE(annotation),
+            "score": 1.0,
+        }
+        for annotation in truth.dataset["annotations"]
+    ]
+    evaluation = COCOeval(truth, truth.loadRes(detections), "segm")
+    evaluation.evaluate()
+    evaluation.accumulate()
+    evaluation.summarize()
+    assert evaluation.stats[0] == pytest.approx(1.0)
+
+
+def test_masks_conform_to_bop(tmp_path: Path, images: list[AnnotatedImage]) -> None:
+    """Masks are 0 or 255 and agree with scene_gt_info.json and with the depth, in mm."""
+    folder = tmp_path / "000000"
+    write_images(folder, images, DEFAULT_CELL.camera, list(CLASSES))
+    gt, info, cameras = (
+        json.loads((folder / f"scene_{name}.json").read_text())
+        for name in ("gt", "gt_info", "camera")
+    )
+    assert list(gt) == list(info) == list(cameras) == ["0", "1"]
+    expected_masks = {f"{int(k):06d}_{n:06d}.png" for k in gt for n in range(len(gt[k]))}
+    for kind in ("mask", "mask_visib"):
+        assert {path.name for path in (folder / kind).iterdir()} == expected_masks
+    for image, instances in gt.items():
+        depth_png = np.asarray(Image.open(folder / "depth" / f"{int(image):06d}.png"))
+        assert depth_png.dtype == np.uint16
+        depth_mm = depth_png * cameras[image]["depth_scale"]
+        for number, instance in enumerate(instances):
+            name = f"{int(image):06d}_{number:06d}.png"
+            mask, visible = (
+                np.asarray(Image.open(folder / kind / name)) for kind in ("mask", "mask_visib")
+            )
+            for array in (mask, visible):
+                assert array.dtype == np.uint8
+                assert array.shape == depth_png.shape
+                assert set(np.unique(array)) <= {0, 255}
+            assert not np.any(visible & ~mask)
+            entry = info[image][number]
+            assert entry["px_count_all"] == np.count_nonzero(mask)
+            assert entry["px_count_visib"] == np.count_nonzero(visible)
+            assert entry["px_count_valid"] == np.count_nonzero(depth_png[mask > 0])
+            R_CO = np.reshape(instance["cam_R_m2c"], (3, 3))
+            names = list(CLASSES)
+            corners = 1000 * CLASSES[names[instance["obj_id"] - 1]].corners
+            corner_depths = (corners @ R_CO.T + instance["cam_t_m2c"])[:, 2]
+            seen = depth_mm[visible > 0]
+            assert np.all(seen > corner_depths.min() - 1)
+            assert np.all(seen < corner_depths.max() + 1)
+
+
+def test_models_conform_to_bop(tmp_path: Path) -> None:
+    """Meshes are in mm in the frame O, with normals and texture; the camera file is complete."""
+    write_dataset_camera(tmp_path, DEFAULT_CELL.camera)
+    camera = json.loads((tmp_path / "camera.json").read_text())
+    assert set(camera) == {"fx", "fy", "cx", "cy", "width", "height", "depth_scale"}
+    assert (camera["width"], camera["height"]) == (640, 480)
+    write_models(tmp_path, list(CLASSES.values()))
+    models = json.loads((tmp_path / "models" / "models_info.json").read_text())
+    assert list(models) == [str(obj_id) for obj_id in range(1, len(CLASSES) + 1)]
+    for (obj_id, info), object_class in zip(models.items(), CLASSES.values(), strict=True):
+        path = tmp_path / "models" / f"obj_{int(obj_id):06d}.ply"
+        header = path.read_text().partition("end_header")[0]
+        assert f"comment TextureFile {path.stem}.png" in header
+        assert path.with_suffix(".png").is_file()
+        for column in ("nx", "ny", "nz", "texture_u", "texture_v"):
+            assert f"property float {column}\n" in header
+        mesh = trimesh.load_mesh(path)
+        lower = [info[f"min_{axis}"] for axis in "xyz"]
+        size = [info[f"size_{axis}"] for axis in "xyz"]
+        assert mesh.bounds[0] == pytest.approx(lower, abs=1e-3)
+        assert mesh.extents == pytest.approx(size, abs=1e-3)
+        assert size == pytest.approx([1000 * extent for extent in object_class.size], abs=0.1)
+        is_cylinder = object_class.shape is Shape.CYLINDER
+        diameter = np.hypot(size[0], size[2]) if is_cylinder else np.linalg.norm(size)
+        assert info["diameter"] == pytest.approx(diameter, rel=0.01)
+        assert ("symmetries_continuous" in info) == is_cylinder
+        for transform in info["symmetries_discrete"]:
+            X = np.reshape(transform, (4, 4))
+            assert np.linalg.det(X[:3, :3]) == pytest.approx(1.0)
+            assert np.abs(X[:3, :3]) @ size == pytest.approx(size)
+        assert len(info["symmetries_discrete"]) == (1 if is_cylinder else 3)
 
 
 def test_encode_run_lengths() -> None:
@@ -189,14 +310,16 @@ def test_the_same_seed_generates_the_same_dataset(
     for out in ("one", "other"):
         script.main(tmp_path / out, count=2, heap_fraction=0.0, seed=3, objects="ycb7")
     files = sorted(path.relative_to(tmp_path / "one") for path in (tmp_path / "one").rglob("*.*"))
-    assert len(files) == 1 + 4 + 6
+    models = 1 + 2 * len(CLASSES)
+    masks = len(list((tmp_path / "one" / TRAIN_FOLDER / "000000" / "mask").iterdir()))
+    assert len(files) == 2 + models + 4 + 6 + 2 * masks
     for file in files:
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "other" / file).read_bytes(), (
             file
         )
-    before = (tmp_path / "one" / "000000").stat().st_mtime_ns
+    before = (tmp_path / "one" / TRAIN_FOLDER / "000000").stat().st_mtime_ns
     script.main(tmp_path / "one", count=2, heap_fraction=0.0, seed=3, objects="ycb7")
-    assert (tmp_path / "one" / "000000").stat().st_mtime_ns == before, (
+    assert (tmp_path / "one" / TRAIN_FOLDER / "000000").stat().st_mtime_ns == before, (
         "what is there is not made again"
     )
     with pytest.raises(InputError, match="of another job"):

@@ -15,13 +15,13 @@ Randomized per item: two to four lights (direction, intensity, color temperature
 image: the colors of each instance and of the tray, and the background beyond it. The camera does
 not move.
 
-An interrupted run is resumed by the same command; a larger count extends the dataset. The scenes
-depend on --seed alone: no scene dataset for evaluation is read.
+The dataset has the layout of BOP: the BOP toolkit reads it as split `train`. An interrupted run is
+resumed by the same command; a larger count extends the dataset. The scenes depend on --seed
+alone: no scene dataset for evaluation is read.
 """
 
 import gc
 import json
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -39,7 +39,18 @@ from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, prepare_output_directory, write_json
-from drake_clutter.perception.image_dataset import LabeledImage, write_images
+from drake_clutter.perception.bop_models import (
+    DATASET_CAMERA_FILE,
+    MODELS_FOLDER,
+    write_dataset_camera,
+    write_models,
+)
+from drake_clutter.perception.image_dataset import (
+    TRAIN_FOLDER,
+    AnnotatedImage,
+    LabeledImage,
+    write_images,
+)
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.camera_renderer import (
@@ -137,10 +148,10 @@ class ItemRenderer:
         is_heap = self._job.is_heap(item)
         scenes = self._heaps(count, rng) if is_heap else self._generated_scenes(count, rng)
         camera = CameraRenderer(self._config.cell.camera, sample_lights(rng))
-        unoccluded_pixels = dict[SceneObject, int]()
-        images = (render_image(camera, scene, unoccluded_pixels, rng) for scene in scenes)
+        silhouettes = dict[SceneObject, NDArray[np.bool_]]()
+        images = (render_image(camera, scene, silhouettes, rng) for scene in scenes)
         write_images(
-            self._out / f"{item:06d}",
+            self._out / TRAIN_FOLDER / f"{item:06d}",
             images,
             self._config.cell.camera,
             list(load_catalog().classes),
@@ -263,32 +274,32 @@ def sample_lights(rng: np.random.Generator) -> RenderEngineVtkParams:
 def render_image(
     camera: CameraRenderer,
     scene: Scene,
-    unoccluded_pixels: dict[SceneObject, int],
+    silhouettes: dict[SceneObject, NDArray[np.bool_]],
     rng: np.random.Generator,
-) -> LabeledImage:
+) -> AnnotatedImage:
     """Return an image of a scene in random colors, with its ground truth.
 
     Args:
         camera: The camera.
         scene: The scene.
-        unoccluded_pixels: Number of pixels that an object covers when nothing occludes it. Objects
-            that are not in it are added.
+        silhouettes: Pixels that an object covers when nothing occludes it. Objects that are not in
+            it are added. Shape (H, W) each.
         rng: Random generator of the colors.
     """
     images = camera.render(scene)
-    # With one visible pixel of each object, the visible fraction is the inverse of its pixels.
-    uncounted = tuple(o for o in scene.objects if o not in unoccluded_pixels)
-    one_pixel_each = np.arange(len(uncounted))
-    fractions = camera.visible_fractions(replace(scene, objects=uncounted), one_pixel_each)
-    unoccluded_pixels |= {o: round(1 / fractions[o.name]) for o in uncounted}
-    return LabeledImage(
+    new = tuple(o for o in scene.objects if o not in silhouettes)
+    masks = camera.silhouettes(replace(scene, objects=new))
+    silhouettes |= dict(zip(new, masks, strict=True))
+    scene_silhouettes = np.array([silhouettes[o] for o in scene.objects])
+    image = LabeledImage(
         randomize_colors(images, len(scene.objects), rng),
         images.depth,
         images.label,
         tuple(o.object_class.name for o in scene.objects),
         tuple(o.X_TO for o in scene.objects),
-        np.array([unoccluded_pixels[o] for o in scene.objects], np.int64),
+        np.count_nonzero(scene_silhouettes, axis=(1, 2)),
     )
+    return AnnotatedImage(image, scene_silhouettes)
 
 
 def randomize_colors(
@@ -362,11 +373,14 @@ def main(
     """Render a dataset of labeled images."""
     job = ImageJob(objects, heap_fraction, seed)
     job_fields = {**to_plain(job), "agents": [agent for agent, _ in job.generators()]}
-    present = [path.name for path in out.iterdir()] if out.is_dir() else []
-    item_folders = [name for name in present if re.fullmatch(r"\.?\d{6}", name)]
-    prepare_output_directory(out, allowed_entries=frozenset({JOB_FILE, *item_folders}))
+    shared_entries = {JOB_FILE, TRAIN_FOLDER, DATASET_CAMERA_FILE, MODELS_FOLDER}
+    prepare_output_directory(out, allowed_entries=frozenset(shared_entries))
     check_job(out, job_fields)
     write_json(out / JOB_FILE, job_fields)
+    write_dataset_camera(out, ClutterConfig().cell.camera)
+    write_models(out, list(load_catalog().classes.values()))
+    (out / TRAIN_FOLDER).mkdir(exist_ok=True)
+    present = {path.name for path in (out / TRAIN_FOLDER).iterdir()}
     num_items = num_images = 0
     while num_images < count:
         num_images += job.num_images(num_items)

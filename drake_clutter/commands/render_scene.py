@@ -10,22 +10,19 @@ from PIL import Image
 from drake_clutter.cell.camera import Camera
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import atomic_write, write_json
+from drake_clutter.perception.image_dataset import encode_depth
 from drake_clutter.reports.scene_images import SceneRenderer
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.simulation.camera_renderer import CameraRenderer
-
-DEPTH_UNIT = 1e-4
-"""Depth per step of the 16-bit `depth.png` [m].
-
-The value is 0 where the depth is unknown or too large for 16 bits.
-"""
 
 
 def render_scene(scene: Scene, config: ClutterConfig, out: Path) -> dict[str, float]:
     """Write the images of a scene at rest.
 
     File names start with the camera's name if the cell has several cameras. `label.png` contains 0
-    where there is no object and k at object k of the scene, counted from 1.
+    where there is no object and k at object k of the scene, counted from 1. It has 16 bits if the
+    scene has more than 255 objects. `depth.png` contains steps of 0.1 mm, and 0 where the depth is
+    unknown or too large for 16 bits.
 
     Args:
         scene: The scene.
@@ -55,11 +52,11 @@ def _write_camera_images(scene: Scene, config: Camera, out: Path, prefix: str) -
     camera = CameraRenderer(config)
     images = camera.render(scene)
     visible_fractions = camera.visible_fractions(scene)
-    depth = np.rint(images.depth / DEPTH_UNIT)
-    depth = np.where(depth <= np.iinfo(np.uint16).max, depth, 0)
     _write_png(out / f"{prefix}color.png", images.color)
-    _write_png(out / f"{prefix}depth.png", depth.astype(np.uint16))
-    _write_png(out / f"{prefix}label.png", (images.label + 1).astype(np.uint8))
+    _write_png(out / f"{prefix}depth.png", encode_depth(images.depth))
+    # Eight bits hold the numbers of 255 objects.
+    label_type = np.uint8 if len(scene.objects) <= np.iinfo(np.uint8).max else np.uint16
+    _write_png(out / f"{prefix}label.png", (images.label + 1).astype(label_type))
     hidden = list(camera.hidden_objects(visible_fractions))
     write_json(
         out / f"{prefix}visible.json",

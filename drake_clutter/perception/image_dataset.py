@@ -1,14 +1,24 @@
 """Datasets of labeled images on disk in the layout of BOP (https://bop.felk.cvut.cz).
 
-Each folder of a dataset, such as `000000/`, holds the images of one scene:
+The folder of a dataset holds what all images share, see `drake_clutter.perception.bop_models`:
+
+    camera.json            Camera: fx, fy, cx, cy, width, height, depth_scale.
+    models/                Mesh of each class in mm, and models_info.json.
+
+Each folder in `train/`, such as `000000/`, holds the images of one scene:
 
     rgb/000000.png         Color image.
     depth/000000.png       Rendered depth without noise, uint16 [0.1 mm]; 0 where there is none.
-    label/000000.png       Instance number of each pixel, uint8; 255: none. Replaces BOP's masks.
+    label/000000.png       Instance number of each pixel, uint8; 255: none. For the detector.
+    mask/000000_000000.png Silhouette of each instance alone: 255 in it, 0 elsewhere.
+    mask_visib/...         Visible part of each silhouette.
     scene_camera.json      Per image: cam_K, depth_scale, cam_R_w2c, cam_t_w2c [mm] (X_CT).
     scene_gt.json          Per instance: obj_id, cam_R_m2c, cam_t_m2c [mm] (X_CO).
-    scene_gt_info.json     Per instance: px_count_all, px_count_visib, visib_fract, bbox_visib.
-    scene_gt_coco.json     The same masks as annotations with COCO run lengths.
+    scene_gt_info.json     Per instance: px_count_all, px_count_valid, px_count_visib, visib_fract,
+                           bbox_obj, bbox_visib.
+    scene_gt_coco.json     The visible masks as annotations with COCO run lengths.
+
+Version 0.1 wrote the folders of the scenes without `train/`, the masks and the shared files.
 
 The obj_id of a class is its index in the catalog plus 1. Frames: T tray, O object, C camera.
 """
@@ -26,6 +36,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from pydantic import AfterValidator, BaseModel, Field
 
+import drake_clutter
 from drake_clutter.cell.camera import Camera
 from drake_clutter.files import InputError, read_json, reading_file
 from drake_clutter.limits import MAX_IMAGE_SIDE
@@ -46,6 +57,10 @@ Entry = TypeVar("Entry")
 COLOR_FOLDER = "rgb"
 DEPTH_FOLDER = "depth"
 LABEL_FOLDER = "label"
+MASK_FOLDER = "mask"
+VISIBLE_MASK_FOLDER = "mask_visib"
+TRAIN_FOLDER = "train"
+"""Folder of the scenes in a dataset."""
 CAMERA_FILE = "scene_camera.json"
 POSES_FILE = "scene_gt.json"
 INFO_FILE = "scene_gt_info.json"
@@ -55,7 +70,7 @@ MAX_INSTANCES = 255
 _CONTENT = "annotations in the format of BOP"
 """What the JSON files may contain, for messages."""
 _NO_INSTANCE = 255
-_DEPTH_UNIT = 1e-4
+DEPTH_UNIT = 1e-4
 """Depth of the value 1 in a depth image [m]."""
 
 
@@ -90,8 +105,31 @@ class LabeledImage:
         return np.asarray(self.visible_pixels / np.maximum(self.unoccluded_pixels, 1))
 
 
+@dataclass(frozen=True)
+class AnnotatedImage:
+    """A labeled image with the masks that are written for other programs.
+
+    Attributes:
+        image: The labeled image.
+        silhouettes: Pixels that each instance covers alone on the tray. Shape (N, H, W).
+    """
+
+    image: LabeledImage
+    silhouettes: NDArray[np.bool_]
+
+
+def encode_depth(depth: NDArray[np.floating[Any]]) -> NDArray[np.uint16]:
+    """Return depths in steps of `DEPTH_UNIT`; 0 where there is none or it exceeds 16 bits.
+
+    Args:
+        depth: Depth [m]; inf or NaN where there is none.
+    """
+    steps = np.rint(depth / DEPTH_UNIT)
+    return np.where(steps <= np.iinfo(np.uint16).max, steps, 0).astype(np.uint16)
+
+
 def write_images(
-    folder: Path, images: Iterable[LabeledImage], camera: Camera, class_names: Sequence[str]
+    folder: Path, images: Iterable[AnnotatedImage], camera: Camera, class_names: Sequence[str]
 ) -> None:
     """Write the images of one scene to a folder that appears once it is complete.
 
@@ -100,10 +138,13 @@ def write_images(
         images: Images of the scene, with at most `MAX_INSTANCES` instances each.
         camera: Camera of the images.
         class_names: Names of the classes of the catalog, in its order.
+
+    Raises:
+        InputError: An image has more than `MAX_INSTANCES` instances.
     """
     temporary = folder.with_name(f".{folder.name}")
     shutil.rmtree(temporary, ignore_errors=True)
-    for kind in (COLOR_FOLDER, DEPTH_FOLDER, LABEL_FOLDER):
+    for kind in (COLOR_FOLDER, DEPTH_FOLDER, LABEL_FOLDER, MASK_FOLDER, VISIBLE_MASK_FOLDER):
         (temporary / kind).mkdir(parents=True)
     camera_entry = _camera_entry(camera)
     camera_entries = dict[str, Any]()
@@ -111,11 +152,17 @@ def write_images(
     info_entries = dict[str, Any]()
     coco_images = list[dict[str, Any]]()
     annotations = list[dict[str, Any]]()
-    for number, image in enumerate(images):
+    for number, annotated in enumerate(images):
+        image = annotated.image
         name = f"{number:06d}.png"
+        if len(image.classes) > MAX_INSTANCES:
+            raise InputError(
+                f"{folder}: an image of {len(image.classes)} instances; "
+                f"allowed are at most {MAX_INSTANCES}"
+            )
         _write_png(image.color, temporary / COLOR_FOLDER / name)
-        depth = np.where(np.isfinite(image.depth), np.round(image.depth / _DEPTH_UNIT), 0)
-        _write_png(depth.astype(np.uint16), temporary / DEPTH_FOLDER / name)
+        depth = encode_depth(image.depth)
+        _write_png(depth, temporary / DEPTH_FOLDER / name)
         label = np.where(image.label < 0, _NO_INSTANCE, image.label)
         _write_png(label.astype(np.uint8), temporary / LABEL_FOLDER / name)
         ids = [class_names.index(class_name) + 1 for class_name in image.classes]
@@ -123,7 +170,11 @@ def write_images(
             {"obj_id": k, **_pose_in_camera(X, camera)}
             for k, X in zip(ids, image.X_TO, strict=True)
         ]
-        info = _visibility_info(image)
+        info = _visibility_info(annotated, depth)
+        for instance, silhouette in enumerate(annotated.silhouettes):
+            mask_name = f"{number:06d}_{instance:06d}.png"
+            _write_mask(silhouette, temporary / MASK_FOLDER / mask_name)
+            _write_mask(image.label == instance, temporary / VISIBLE_MASK_FOLDER / mask_name)
         camera_entries[str(number)] = camera_entry
         pose_entries[str(number)] = poses
         info_entries[str(number)] = info
@@ -154,7 +205,16 @@ def write_images(
                     }
                 )
     categories = [{"id": k, "name": name} for k, name in enumerate(class_names, start=1)]
-    coco = {"images": coco_images, "annotations": annotations, "categories": categories}
+    coco = {
+        "info": {
+            "description": "Rendered images of drake_clutter",
+            "version": drake_clutter.__version__,
+        },
+        "licenses": [],
+        "images": coco_images,
+        "annotations": annotations,
+        "categories": categories,
+    }
     for file, document in (
         (CAMERA_FILE, camera_entries),
         (POSES_FILE, pose_entries),
@@ -169,6 +229,10 @@ def write_images(
 def _write_png(pixels: NDArray[np.uint8] | NDArray[np.uint16], path: Path) -> None:
     # Level 1 makes files that are a fifth larger than by default in a fraction of the time.
     Image.fromarray(pixels).save(path, compress_level=1)
+
+
+def _write_mask(mask: NDArray[np.bool_], path: Path) -> None:
+    _write_png(np.where(mask, np.uint8(255), np.uint8(0)), path)
 
 
 def encode_run_lengths(mask: NDArray[np.bool_]) -> list[int]:
@@ -194,7 +258,7 @@ def _camera_entry(camera: Camera) -> dict[str, Any]:
     u0, v0 = camera.principal_point
     return {
         "cam_K": [camera.focal_length, 0.0, u0, 0.0, camera.focal_length, v0, 0.0, 0.0, 1.0],
-        "depth_scale": 1000 * _DEPTH_UNIT,
+        "depth_scale": 1000 * DEPTH_UNIT,
         "cam_R_w2c": X_CT.rotation().matrix().ravel().tolist(),
         "cam_t_w2c": (1000 * X_CT.translation() + 0.0).tolist(),  # The sum turns -0.0 into 0.0.
     }
@@ -210,23 +274,32 @@ def _pose_in_camera(X_TO: Pose, camera: Camera) -> dict[str, list[float]]:
     }
 
 
-def _visibility_info(image: LabeledImage) -> list[dict[str, Any]]:
+def _bounding_box(mask: NDArray[np.bool_]) -> list[int]:
+    """Return the left column, upper row, width and height of a mask; all -1 if it is empty."""
+    rows, columns = np.nonzero(mask)
+    if not rows.size:
+        return [-1, -1, -1, -1]
+    width = int(np.ptp(columns)) + 1
+    height = int(np.ptp(rows)) + 1
+    return [int(columns.min()), int(rows.min()), width, height]
+
+
+def _visibility_info(annotated: AnnotatedImage, depth: NDArray[np.uint16]) -> list[dict[str, Any]]:
+    """Return BOP's information on the instances of an image, given its encoded depth."""
+    image = annotated.image
     entries = []
     counts = zip(
         image.visible_pixels, image.unoccluded_pixels, image.visible_fractions, strict=True
     )
     for instance, (visible, unoccluded, fraction) in enumerate(counts):
-        box = [-1, -1, -1, -1]
-        if visible:
-            rows, columns = np.nonzero(image.label == instance)
-            width = int(np.ptp(columns)) + 1
-            height = int(np.ptp(rows)) + 1
-            box = [int(columns.min()), int(rows.min()), width, height]
+        silhouette = annotated.silhouettes[instance]
         entry = {
             "px_count_all": int(unoccluded),
+            "px_count_valid": int(np.count_nonzero(depth[silhouette])),
             "px_count_visib": int(visible),
             "visib_fract": float(fraction),
-            "bbox_visib": box,
+            "bbox_obj": _bounding_box(silhouette),
+            "bbox_visib": _bounding_box(image.label == instance),
         }
         entries.append(entry)
     return entries
@@ -241,7 +314,9 @@ class ImageDataset:
         Raises:
             InputError: The folder holds no images.
         """
-        scenes = sorted(path for path in folder.glob("[0-9]*") if (path / COCO_FILE).is_file())
+        # Datasets of version 0.1 have no such folder.
+        split = folder / TRAIN_FOLDER if (folder / TRAIN_FOLDER).is_dir() else folder
+        scenes = sorted(path for path in split.glob("[0-9]*") if (path / COCO_FILE).is_file())
         self._files = [
             (scene, path.stem)
             for scene in scenes

@@ -306,7 +306,7 @@ class PoseFitter:
 
 
 @lru_cache(maxsize=4096)
-def _symmetry_rotations(object_class: ObjectClass) -> Floats:
+def symmetry_rotations(object_class: ObjectClass) -> Floats:
     """Return the rotations that map a box onto itself; only the identity for other shapes.
 
     These are half turns about its axes, and quarter turns about the axes of square faces. Shape
@@ -329,7 +329,7 @@ def _rotation_error(object_class: ObjectClass, R_TA: Floats, R_TB: Floats) -> fl
     if object_class.shape is Shape.CYLINDER:
         sine = float(np.linalg.norm(np.cross(R_TA[:, 2], R_TB[:, 2])))
         return math.atan2(sine, abs(float(R_TA[:, 2] @ R_TB[:, 2])))
-    traces = np.einsum("ij,nji->n", R_TA.T @ R_TB, _symmetry_rotations(object_class))
+    traces = np.einsum("ij,nji->n", R_TA.T @ R_TB, symmetry_rotations(object_class))
     cosine = (float(traces.max()) - 1) / 2
     return math.acos(min(max(cosine, -1.0), 1.0))
 

@@ -1,7 +1,7 @@
 """Rendering in Drake: images of a scene, and visible fractions of objects."""
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
 import networkx as nx
@@ -245,16 +245,21 @@ class CameraRenderer:
             minlength=len(scene.objects) + 1,
         )[1:]
         unoccluded = np.zeros(len(scene.objects), int)
-        for group in self._non_overlapping_groups(scene):
-            labels = self._place_objects(scene, {scene.objects[i].name for i in group})
-            counts = np.bincount(
-                self._label_image(labels, self._X_TC).ravel() + 1, minlength=len(scene.objects) + 1
-            )[1:]
+        for group, group_label in self._group_labels(scene):
+            counts = np.bincount(group_label.ravel() + 1, minlength=len(scene.objects) + 1)[1:]
             unoccluded[group] = counts[group]
         return {
             o.name: float(visible[i] / unoccluded[i]) if unoccluded[i] else 1.0
             for i, o in enumerate(scene.objects)
         }
+
+    def silhouettes(self, scene: Scene) -> NDArray[np.bool_]:
+        """Return the pixels that each object covers alone on the support. Shape (N, H, W)."""
+        masks = np.zeros((len(scene.objects), self.camera.height, self.camera.width), np.bool_)
+        for group, group_label in self._group_labels(scene):
+            for index in group:
+                masks[index] = group_label == index
+        return masks
 
     def hidden_objects(self, fractions: Mapping[str, float]) -> tuple[str, ...]:
         """Return the names of the objects whose visible fraction is below the threshold."""
@@ -263,6 +268,12 @@ class CameraRenderer:
             for name, fraction in fractions.items()
             if fraction < self.camera.visibility_threshold
         )
+
+    def _group_labels(self, scene: Scene) -> Iterator[tuple[list[int], NDArray[np.int64]]]:
+        """Yield groups of objects that do not overlap, each with a label image of it alone."""
+        for group in self._non_overlapping_groups(scene):
+            labels = self._place_objects(scene, {scene.objects[i].name for i in group})
+            yield group, self._label_image(labels, self._X_TC)
 
     def _non_overlapping_groups(self, scene: Scene) -> list[list[int]]:
         """Return groups of objects that do not overlap in the image."""
