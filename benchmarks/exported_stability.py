@@ -138,17 +138,17 @@ def main(
 ) -> None:
     """Simulate the scenes of all datasets in both simulators."""
     header = {
-        "count": count,
         "max_displacement_mm": 1000 * MAX_DISPLACEMENT,
         "duration_s": DURATION,
         "pybullet_time_step_s": TIME_STEP,
         "pybullet_solver_iterations": SOLVER_ITERATIONS,
     }
-    results = ResultsFile(out, header, ("dataset", "simulator")) if out else None
+    results = ResultsFile(out, header, ("dataset", "simulator", "scenes")) if out else None
     rows = []
     for name in DATASETS:
         for simulator in SIMULATORS:
-            row = results.find({"dataset": name, "simulator": simulator}) if results else None
+            key = {"dataset": name, "simulator": simulator, "scenes": count}
+            row = results.find(key) if results else None
             if row is None:
                 row = measure(name, simulator, count)
                 if results:
