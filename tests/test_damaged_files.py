@@ -51,6 +51,7 @@ from drake_clutter.grammar import SceneGrammar
 from drake_clutter.learning.checkpoint import save_checkpoint
 from drake_clutter.learning.training_run import TrainingRun
 from drake_clutter.perception.image_dataset import (
+    AnnotatedImage,
     ImageDataset,
     LabeledImage,
     _read_cameras,
@@ -413,7 +414,8 @@ def image_dataset(folder: Path) -> Reader:
         (Pose((0.1, 0.0, 0.02)),),
         np.array([16]),
     )
-    write_images(folder / "000000", [image], camera, ["cracker_box", "sugar_box"])
+    annotated = AnnotatedImage(image, label[None] == 0)
+    write_images(folder / "000000", [annotated], camera, ["cracker_box", "sugar_box"])
 
     def read() -> None:
         for cached in (_read_cameras, _read_infos, _read_poses):
