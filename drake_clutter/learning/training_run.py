@@ -1,5 +1,6 @@
 """Training runs in a folder with configuration, history, curves and resumable state."""
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -125,7 +126,13 @@ class TrainingRun:
         Args:
             charts: Metrics by name.
             losses: Losses by name.
+
+        Raises:
+            InputError: A metric or a loss is NaN or infinite: the training has diverged.
         """
+        for name, value in {**charts, **losses}.items():
+            if not math.isfinite(value):
+                raise self._divergence_error(name)
         step = self._learner.step
         elapsed = time.monotonic() - self._start_time
         rate = (step - self._start_step) / elapsed if step > self._start_step else 0.0
@@ -160,13 +167,17 @@ class TrainingRun:
             InputError: The training has diverged. The state that was saved last is kept.
         """
         if has_diverged(self._learner.network):
-            saved = self._folder / STATE_FILE
-            kept = f"{STATE_FILE} of an earlier step is kept" if saved.exists() else "none is saved"
-            raise input_error(
-                f"--out {self._folder}",
-                f"step {self._learner.step}: weights are NaN, the training diverged; {kept}; "
-                "expected finite weights, try a smaller learning rate",
-            )
+            raise self._divergence_error("weights")
+
+    def _divergence_error(self, name: str) -> InputError:
+        """Return the error of values that are not finite, by their name."""
+        saved = self._folder / STATE_FILE
+        kept = f"{STATE_FILE} of an earlier step is kept" if saved.exists() else "no state is saved"
+        return input_error(
+            f"--out {self._folder}",
+            f"step {self._learner.step}: {name} NaN or infinite, the training diverged; {kept}; "
+            "expected finite numbers, try a smaller learning rate",
+        )
 
     def save(self) -> None:
         """Write the learner's state."""
