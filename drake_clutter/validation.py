@@ -402,7 +402,7 @@ def _get_nested(config: Any, parts: Sequence[str]) -> Any:
 
 
 def _field_values(config: Any) -> dict[str, Any]:
-    """Return the fields of a model or dataclass by name; none of anything else."""
+    """Return the fields of a model or dataclass by name; empty for other values."""
     if isinstance(config, BaseModel):
         return dict(config)
     if dataclasses.is_dataclass(config):

@@ -148,7 +148,7 @@ class Gripper(Protocol):
         """
 
     def load_ratio(self, force: Floats, moment: Floats) -> Floats:
-        """Return the ratio of a load to the load capacity; the object comes off above 1.
+        """Return the ratio of a load to the load capacity; the object detaches above 1.
 
         Args:
             force: Force of the object on the gripper, in G [N]. Shape (..., 3).

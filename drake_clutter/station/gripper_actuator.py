@@ -19,8 +19,10 @@ from drake_clutter.station.clutter_station import ClutterStation
 GRIPPER_UPDATE_PERIOD = 0.01
 """Period at which the command and the load are checked [s]."""
 OVERLOAD_RELEASE_TIME = 0.02
-"""Duration of an overload after which the object comes off [s]: air leaks in. Shorter peaks come
-from contacts."""
+"""Duration of an overload after which the object detaches [s].
+
+Air leaks in during this time. Shorter peaks come from contacts.
+"""
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class GraspStatus:
     Attributes:
         held: Name of the object that is held; "" for none.
         last_held: Name of the object that was held last; "" for none.
-        release_time: Time at which the object came off by overload [s]; NaN if it did not.
+        release_time: Time at which the object detached by overload [s]; NaN if it did not.
         max_load_ratio: Largest ratio of the load to the load capacity.
         slip: Displacement between object and gripper from attachment to release [m]; NaN before
             the release.

@@ -240,9 +240,11 @@ class ClosedLoop:
         lowered_distance = self.simulation.executor_state.lowered_distance
         X_TO_place = transport_pose(plan.X_TO_pick, plan.X_TO_place, before[picked].X_TO)
         X_TO_place = X_TO_place.translated((0.0, 0.0, -lowered_distance))
-        came_off = not grasp.has_held or grasp.lost_object
-        outcome = evaluate_outcome(before, after, picked, X_TO_place, came_off, self._config.settle)
+        lost_object = not grasp.has_held or grasp.lost_object
+        outcome = evaluate_outcome(
+            before, after, picked, X_TO_place, lost_object, self._config.settle
+        )
         error = float(np.linalg.norm((after[picked].X_TO.p - X_TO_place.p)[:2]))
-        result = "came off the cup" if came_off else "placed"
+        result = "came off the cup" if lost_object else "placed"
         detail = f"{result} with a horizontal error of {1000 * error:.1f} mm"
         return picked, replace(outcome, detail=detail)
