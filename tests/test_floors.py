@@ -23,7 +23,7 @@ FLOORS = {
     6: {"station"},
     7: {"agents"},
     8: {"systems"},
-    9: {"cli", "commands", "installation_check", "reports"},
+    9: {"__main__", "cli", "commands", "installation_check", "reports"},
 }
 FLOOR_OF = {room: floor for floor, rooms in FLOORS.items() for room in rooms}
 MODULES = sorted(
