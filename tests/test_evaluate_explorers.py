@@ -104,7 +104,7 @@ def test_misuse_is_reported_before_any_episode_is_run(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=message):
             script.main(tmp_path / "episodes", only="sg_14", count=1, agents=agents, out=out)
     out.write_text('{"rows": []}')
-    with pytest.raises(InputError, match=r"--out .*table\.json: is not a results file \('seed'\)"):
+    with pytest.raises(InputError, match=r"--out .*table\.json: cannot be read \(lacks 'seed'\)"):
         script.main(tmp_path / "episodes", only="sg_14", count=1, agents=["random"], out=out)
     assert list((tmp_path / "episodes").iterdir()) == []
 
