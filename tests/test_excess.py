@@ -85,7 +85,7 @@ def test_the_largest_seed_is_accepted() -> None:
 
 def test_a_warm_start_of_another_kind_is_refused() -> None:
     path = resource_path("training/checkpoints/student.safetensors")
-    with pytest.raises(InputError, match=r"another kind \('student'\); expected a generator"):
+    with pytest.raises(InputError, match=r"another kind \(student\); expected a generator"):
         load_generator_checkpoint(path)
 
 

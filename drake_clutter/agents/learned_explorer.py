@@ -15,7 +15,7 @@ from pydantic import Field
 
 from drake_clutter.agents.explorer_network import ExplorerNetwork, collate_graphs, sample_actions
 from drake_clutter.config import ExplorationConfig
-from drake_clutter.files import InputError, format_value, input_error
+from drake_clutter.files import InputError, input_error
 from drake_clutter.learning.checkpoint import Checkpoint, load_checkpoint, load_weights
 from drake_clutter.scenes.interfaces import Move, Observation
 from drake_clutter.scenes.placement import find_free_placements
@@ -75,11 +75,10 @@ def load_explorer(
     """
     metadata = checkpoint.metadata
     allowed = (TEACHER, STUDENT) if kind is None else (kind,)
-    if metadata.get("kind") not in allowed:
+    if checkpoint.kind not in allowed:
         raise input_error(
             str(path),
-            f"is a checkpoint of a {format_value(metadata.get('kind'))}; "
-            f"expected one of a {' or '.join(allowed)}",
+            f"is a checkpoint of a {checkpoint.kind}; expected one of a {' or '.join(allowed)}",
         )
     network_metadata: dict[str, Any] = metadata.get("network", {})
     validate(_NetworkEntry, network_metadata, f"{path.with_suffix('.json')}: network")

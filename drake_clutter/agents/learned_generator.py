@@ -12,7 +12,7 @@ from drake_clutter.agents.graph_network import RuleQNetwork
 from drake_clutter.agents.replay_buffer import collate
 from drake_clutter.agents.soft_q import sample_softmax_actions
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import InputError, format_value, input_error
+from drake_clutter.files import InputError, input_error
 from drake_clutter.grammar import Derivation, NodeBudget, SceneGrammar
 from drake_clutter.learning.checkpoint import Checkpoint, load_checkpoint, load_weights
 from drake_clutter.stability.static_judge import StaticStabilityJudge
@@ -53,11 +53,10 @@ def load_generator_checkpoint(path: Path) -> Checkpoint:
         InputError: The file cannot be read, or is not a checkpoint of a scene generator.
     """
     checkpoint = load_checkpoint(path)
-    kind = checkpoint.metadata.get("kind")
-    if kind != CHECKPOINT_KIND:
+    if checkpoint.kind != CHECKPOINT_KIND:
         raise input_error(
             str(path),
-            f"is a checkpoint of another kind ({format_value(kind)}); "
+            f"is a checkpoint of another kind ({checkpoint.kind}); "
             f"expected a {CHECKPOINT_KIND} of training/train_generator.py",
         )
     validate(_GeneratorMetadata, checkpoint.metadata, str(path.with_suffix(".json")))

@@ -58,6 +58,11 @@ class Checkpoint:
     metadata: dict[str, Any]
     path: Path
 
+    @property
+    def kind(self) -> str:
+        """Kind of the network, as text of at most 40 characters."""
+        return str(self.metadata.get("kind"))[:40]
+
 
 def save_checkpoint(path: Path, network: nn.Module, metadata: dict[str, Any]) -> None:
     """Write a network's weights, and a .json file with metadata beside them.

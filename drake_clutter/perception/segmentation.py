@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.support import Support
 from drake_clutter.compilation import njit
-from drake_clutter.files import format_value, input_error
+from drake_clutter.files import input_error
 from drake_clutter.learning.checkpoint import load_checkpoint, load_weights
 from drake_clutter.validation import Flag, NonEmptyText, validate
 
@@ -274,11 +274,10 @@ class SegmentationNetwork(nn.Module):
         """
         checkpoint = load_checkpoint(path)
         metadata = {RENAMED_METADATA.get(key, key): v for key, v in checkpoint.metadata.items()}
-        kind = metadata.get("kind")
-        if kind != CHECKPOINT_KIND:
+        if checkpoint.kind != CHECKPOINT_KIND:
             raise input_error(
                 str(path),
-                f"is a checkpoint of a {format_value(kind)}; expected one of a {CHECKPOINT_KIND}",
+                f"is a checkpoint of a {checkpoint.kind}; expected one of a {CHECKPOINT_KIND}",
             )
         validate(_DetectorMetadata, metadata, str(path.with_suffix(".json")))
         network = SegmentationNetwork(metadata["classes"], metadata["use_color"])
