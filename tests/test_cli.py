@@ -221,7 +221,7 @@ def test_evaluate_accepts_names_of_shipped_scene_datasets() -> None:
     (row,) = json.loads(shown.stdout)
     assert (row["agent"], row["episodes"]) == ("largest-clear", 2)
     assert row["hidden"] > 0
-    assert "--scenes: give it once" in run("evaluate", code=2).stderr
+    assert "--scenes: expected once" in run("evaluate", code=2).stderr
 
 
 def test_move_executes_a_list(scene: Path, tmp_path: Path) -> None:

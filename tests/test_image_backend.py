@@ -112,7 +112,7 @@ def test_summary_of_closed_loop_episodes() -> None:
         None,
         {"exception": 1},
     )
-    assert script.table_row(nothing)["moves"] == ""
+    assert script.table_row(nothing)["moves"] == "-"
 
 
 def test_recorded_episodes_are_not_repeated(
