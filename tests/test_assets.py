@@ -241,7 +241,7 @@ def test_convex_mesh_is_one_piece_with_the_inertia_of_its_box(tmp_path: Path) ->
         ("{base: red}", r"classes\.block\.label\.base: 'red'; expected a color"),
         ("{accent: '#12345'}", r"classes\.block\.label\.accent"),
         (
-            "{title: A title that nobody could ever read}",
+            "{title: A title too long for the label}",
             r"classes\.block\.label\.title: .*at most 24",
         ),
     ],

@@ -430,15 +430,15 @@ def test_an_interrupted_training_ends_with_the_same_weights(
 
 def test_ppo_starts_from_a_cloned_student(file: Path, tmp_path: Path) -> None:
     """At a learning rate of 0 the weights are unchanged; a teacher is rejected as a student."""
-    node_kind_ids, begun = ClutterExploration(file).node_kind_ids, tmp_path / "s.safetensors"
+    node_kind_ids, start_file = ClutterExploration(file).node_kind_ids, tmp_path / "s.safetensors"
     torch.manual_seed(3)
     cloned = ExplorerNetwork(len(node_kind_ids), 8)
     save_checkpoint(
-        begun, cloned, {"kind": STUDENT, "network": explorer_metadata(node_kind_ids, 8)}
+        start_file, cloned, {"kind": STUDENT, "network": explorer_metadata(node_kind_ids, 8)}
     )
     settings = [
         f"scenes={file}",
-        f"warm_start={begun}",
+        f"warm_start={start_file}",
         *TEACHER_SETTINGS,
         "learning.total_timesteps=10",
         "learning.learning_rate=1.0e-30",
@@ -460,8 +460,8 @@ def test_ppo_starts_from_a_cloned_student(file: Path, tmp_path: Path) -> None:
 
 
 def test_invalid_agents_are_rejected(file: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"--agent nobody; expected random, .*full-knowledge"):
-        make_policy_factory("nobody", ClutterConfig())
+    with pytest.raises(InputError, match=r"--agent unknown; expected random, .*full-knowledge"):
+        make_policy_factory("unknown", ClutterConfig())
     path = tmp_path / "s.safetensors"
     node_kind_ids = ClutterExploration(file).node_kind_ids
     about = {"kind": STUDENT, "network": explorer_metadata(node_kind_ids, 8)}

@@ -73,7 +73,7 @@ _PACKAGE_XML = """<?xml version="1.0"?>
   <name>{name}</name>
   <version>0.0.0</version>
   <description>{description}</description>
-  <maintainer email="nobody@example.com">drake_clutter authors</maintainer>
+  <maintainer email="maintainers@example.com">drake_clutter authors</maintainer>
   <license>BSD-3-Clause</license>
 </package>
 """

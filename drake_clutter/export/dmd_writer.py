@@ -20,7 +20,7 @@ _PACKAGE_XML = f"""<?xml version="1.0"?>
   <name>{PACKAGE}</name>
   <version>0.0.0</version>
   <description>A scene exported by drake_clutter.</description>
-  <maintainer email="nobody@example.com">drake_clutter authors</maintainer>
+  <maintainer email="maintainers@example.com">drake_clutter authors</maintainer>
   <license>BSD-3-Clause</license>
 </package>
 """

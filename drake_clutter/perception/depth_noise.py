@@ -22,7 +22,7 @@ class DepthNoise:
 
     Attributes:
         focal_length: f [px].
-        baseline: b [m]. The second imager is to the right of the one that the image belongs to, so
+        baseline: b [m]. The second imager is to the right of the imager of the image, so
             occlusion shadows fall to the left of objects.
         disparity_noise: Standard deviation of the disparity of a single match [px] (Intel, "Best
             known methods for tuning Intel RealSense D400 depth cameras for best performance").

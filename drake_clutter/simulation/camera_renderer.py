@@ -105,7 +105,7 @@ class RenderCameras:
 def _tray_clipping_range(X_TC: RigidTransform) -> ClippingRange:
     """Return a narrow clipping range around everything on the support.
 
-    Where two surfaces meet at the center of a pixel, the engine shows the one that it draws first,
+    Where two surfaces meet at the center of a pixel, the engine shows whichever it draws first,
     and its order differs between engines. A narrow range makes the depth buffer finer (0.1 um
     instead of 3 um) and such ties rare.
     """

@@ -233,7 +233,7 @@ class ClosedLoop:
         before = self.scene
         after = self.simulation.scene
         grasp = self.simulation.gripper.status
-        # The object on the cup may not be the one that the policy intended to pick.
+        # The object on the cup may differ from the object that the policy meant to pick.
         picked = grasp.last_held or nearest_object(before.objects, plan.X_TO_pick).name
         # The detected pose may differ from the true one by an error or by a symmetry, and the
         # object is placed with the same difference.
