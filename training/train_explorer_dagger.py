@@ -30,7 +30,7 @@ class DAggerTrainingConfig(ExplorerTrainingConfig):
 
     Attributes:
         teacher: Checkpoint of the teacher.
-        evaluate_every: Rounds between two evaluations.
+        evaluate_every: Iterations between two evaluations.
         learning: Hyperparameters of DAgger.
     """
 
