@@ -28,8 +28,8 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.files import write_json
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
-from drake_clutter.planning.pick_place_search import INFLUENCE_DISTANCE, MAX_REPORTED_DISTANCE
 from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.planning.segment_planner import INFLUENCE_DISTANCE, MAX_REPORTED_DISTANCE
 from drake_clutter.planning.time_parameterization import (
     bspline_path,
     parameterize_time_optimal,

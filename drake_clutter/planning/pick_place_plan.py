@@ -58,6 +58,38 @@ class PlanningFailure:
         return f"{self.reason.value}{f': {self.detail}' if self.detail else ''}"
 
 
+class FailureLog:
+    """Log of failed attempts that keeps the one that came closest to a plan.
+
+    Attributes:
+        furthest: Failure of the attempt that came closest to a plan.
+    """
+
+    def __init__(self) -> None:
+        """Create a log without attempts, in which no grasp is reachable."""
+        self.furthest = PlanningFailure(PlanningFailureReason.UNREACHABLE, "the grasp")
+        self._progress = -1
+
+    def record(
+        self,
+        progress: int,
+        reason: PlanningFailureReason,
+        detail: str,
+        value: float = math.nan,
+    ) -> None:
+        """Record a failure as the furthest one if no earlier attempt came as far.
+
+        Args:
+            progress: Stage of planning that failed; later stages are larger.
+            reason: Reason of the failure.
+            detail: See `PlanningFailure`.
+            value: See `PlanningFailure`.
+        """
+        if progress > self._progress:
+            self._progress = progress
+            self.furthest = PlanningFailure(reason, detail, value)
+
+
 @dataclass(frozen=True)
 class TrajectorySegment:
     """A part of a plan that starts and ends at rest.

@@ -124,17 +124,17 @@ class PickPlacePlanner:
         for grasp in grasps:
             for q_pick, q_place, yaw in search.ik_candidates(grasp):
                 if search.num_attempts >= self.config.max_attempts:
-                    return search.furthest_failure
+                    return search.failures.furthest
                 if time.perf_counter() - start_time > self.config.time_limit:
                     return PlanningFailure(
                         PlanningFailureReason.TIME_OUT,
-                        str(search.furthest_failure),
+                        str(search.failures.furthest),
                         self.config.time_limit,
                     )
                 plan = search.plan_grasp(grasp, q_pick, q_place, yaw)
                 if plan is not None:
                     return plan
-        return search.furthest_failure
+        return search.failures.furthest
 
     def can_grasp(self, scene_object: SceneObject) -> bool:
         """Return whether the gripper has a grasp on an object that holds its weight."""

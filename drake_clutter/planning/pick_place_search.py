@@ -4,81 +4,35 @@ Frames: T is the support, G is the gripper, O is the picked object.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
-from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
-from drake_clutter.cell.gripper import Grasp, Payload
+from drake_clutter.cell.gripper import Grasp
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.planning.collision_model import CollisionModel, SignedDistance
+from drake_clutter.planning.collision_model import CollisionModel
 from drake_clutter.planning.pick_place_plan import (
-    DESCENT_SPEED,
+    FailureLog,
     PickPlacePlan,
-    PlanningFailure,
     PlanningFailureReason,
     TrajectorySegment,
 )
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.planning.time_parameterization import (
-    MAX_JOINT_STEP,
-    bspline_path,
-    min_travel_time,
-    parameterize_time_optimal,
-    sample_path,
-    scale_to_limits,
-)
+from drake_clutter.planning.segment_planner import EndpointContext, SegmentPlanner
+from drake_clutter.planning.time_parameterization import min_travel_time
 from drake_clutter.planning.tool_kinematics import (
-    CarryPath,
     ToolKinematics,
     downward_pose,
     invert_pose,
     raise_pose,
 )
-from drake_clutter.planning.trajectory_optimization import (
-    LinearizedDistance,
-    TrajectoryOptimizationProblem,
-    optimize_trajectory,
-)
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.scene_plant import rigid_transform
 
 Floats = NDArray[np.float64]
-
-
-MAX_REPORTED_DISTANCE = 0.03
-"""Distances above this are not computed when a path is checked [m]."""
-CONTACT_TOLERANCE = 0.0005
-"""The attached object may come closer by this to what it touches at its pick and place poses [m]:
-poses of objects at rest have slight penetrations."""
-OPTIMIZATION_MARGIN = 0.005
-"""Distance that trajectory optimization keeps in addition to `PlannerConfig.min_distance` [m]. It
-imposes distances at few points; the check afterwards is dense."""
-INFLUENCE_DISTANCE = 0.06
-"""Distances above this are ignored by trajectory optimization [m]."""
-_DESCENT_STEP = 0.005
-"""Distance between checked points of a guarded descent [m]."""
-MAX_CARRY_TILT = math.radians(0.5)
-"""Largest tilt of the gripper while it carries an object [rad]; the suction cup is planned for
-vertical loads."""
-
-
-@dataclass(frozen=True)
-class EndpointContext:
-    """Distances that are allowed near the pick or the place pose.
-
-    Attributes:
-        p_TG_xy: Horizontal position of the gripper at the endpoint [m]. Shape (2,).
-        allowed_distances: Allowed distance at the endpoint between the attached object and each
-            body that it touches there, by name [m].
-    """
-
-    p_TG_xy: Floats
-    allowed_distances: Mapping[str, float]
 
 
 def _to_matrix(X_AB: RigidTransform) -> Floats:
@@ -90,7 +44,7 @@ class PickPlaceSearch:
 
     Attributes:
         num_attempts: Number of combinations of grasp, IK solution and transfer height tried so far.
-        furthest_failure: Failure of the attempt that came closest to a plan.
+        failures: Log of the failed attempts.
     """
 
     def __init__(
@@ -116,17 +70,17 @@ class PickPlaceSearch:
         """
         self._cell = cell
         self._config = config
-        self._collision_model = collision_model
         self._picked = picked
         self._tool = ToolKinematics(cell)
         self._robot = self._tool.robot
         self._X_TO_goal = X_TO_place
         self._X_TO = _to_matrix(rigid_transform(picked.X_TO))
         self._X_TO_place = _to_matrix(rigid_transform(X_TO_place))
-        self._grasp_contacts = [(link, picked.name) for link in cell.gripper.contact_links]
         self.num_attempts = 0
-        self.furthest_failure = PlanningFailure(PlanningFailureReason.UNREACHABLE, "the grasp")
-        self._progress = -1
+        self.failures = FailureLog()
+        self._segments = SegmentPlanner(
+            cell, config, collision_model, picked, X_TO_place, self.failures
+        )
         placed = replace(picked, X_TO=X_TO_place)
         others = [o for o in objects if o is not picked]
         # Heights of the object's bottom: above its pick and place pose, or above a higher obstacle.
@@ -136,25 +90,6 @@ class PickPlaceSearch:
         lift_height = self._config.lift_height
         self._transfer_heights = [bottom + lift_height]
         self._transfer_heights += [top + lift_height for top in tops if top > bottom]
-
-    def record_failure(
-        self,
-        progress: int,
-        reason: PlanningFailureReason,
-        detail: str,
-        value: float = math.nan,
-    ) -> None:
-        """Record a failure as the furthest one if no earlier attempt came as far.
-
-        Args:
-            progress: Stage of planning that failed; later stages are larger.
-            reason: Reason of the failure.
-            detail: See `PlanningFailure`.
-            value: See `PlanningFailure`.
-        """
-        if progress > self._progress:
-            self._progress = progress
-            self.furthest_failure = PlanningFailure(reason, detail, value)
 
     def ik_candidates(self, grasp: Grasp) -> list[tuple[Floats, Floats, float]]:
         """Return pairs of inverse kinematics solutions at the grasp and at the place pose.
@@ -172,7 +107,7 @@ class PickPlaceSearch:
         q_place = self._robot.ik.match(q_pick, q_place)
         is_pick_reachable = np.isfinite(q_pick[..., 0])
         if (is_pick_reachable & ~np.isfinite(q_place[..., 0])).any():
-            self.record_failure(0, PlanningFailureReason.UNREACHABLE, "the place")
+            self.failures.record(0, PlanningFailureReason.UNREACHABLE, "the place")
         q_pick = self._robot.unwrap(q_pick, home)
         q_place = self._robot.unwrap(q_place, q_pick)
         displacements = np.array([q_pick - home, q_place - q_pick, q_place - home])
@@ -188,65 +123,6 @@ class PickPlaceSearch:
         """Return X_TG at the place pose for X_TG at the grasp. Shapes (4, 4)."""
         return np.asarray(self._X_TO_place @ invert_pose(self._X_TO) @ X_TG)
 
-    def _min_distance_along(
-        self, path: Floats, endpoint: EndpointContext, progress: int, stage: str
-    ) -> SignedDistance | None:
-        """Return the smallest distance along a path to obstacles that it may not touch.
-
-        Args:
-            path: Configurations. Shape (m, n).
-            endpoint: Endpoint near which smaller distances are allowed.
-            progress: Stage of planning, see `record_failure`.
-            stage: Name of the stage for the failure.
-
-        Returns:
-            The distance, infinite if nothing is near, or None after recording a failure if a
-            distance is too small.
-        """
-        closest = SignedDistance(math.inf)
-        min_distance = self._config.min_distance
-        for q in path:
-            for distance in self._collision_model.distances_below(q, MAX_REPORTED_DISTANCE):
-                required = self._required_distance(distance, endpoint, min_distance)
-                if distance.distance < required:
-                    self.record_failure(
-                        progress,
-                        PlanningFailureReason.IN_COLLISION,
-                        f"{stage}: {' and '.join(distance.pair)}",
-                        distance.distance,
-                    )
-                    return None
-                if (
-                    required == min_distance
-                    and distance.distance < closest.distance
-                    and distance.pair[1] not in self._collision_model.arm_names
-                ):
-                    closest = distance
-        return closest
-
-    def _required_distance(
-        self, distance: SignedDistance, endpoint: EndpointContext, min_distance: float
-    ) -> float:
-        """Return the required distance of a pair at the last query's configuration [m].
-
-        The gripper may touch the picked object, and the attached object may touch its neighbors at
-        the endpoint. The required distance grows with the horizontal distance from the endpoint.
-
-        Args:
-            distance: Distance of the pair.
-            endpoint: Endpoint near which smaller distances are allowed.
-            min_distance: Required distance of all other pairs [m].
-        """
-        first, second = distance.pair
-        if distance.pair in self._grasp_contacts:
-            allowed = self._config.lip_gap / 2
-        elif first == self._picked.name and second in endpoint.allowed_distances:
-            allowed = endpoint.allowed_distances[second]
-        else:
-            return min_distance
-        offset = self._collision_model.gripper_position()[:2] - endpoint.p_TG_xy
-        return min(min_distance, allowed + float(np.linalg.norm(offset)))
-
     def _grasp_poses(self, grasp: Grasp, yaw: float) -> tuple[Floats, Floats, RigidTransform]:
         """Return X_TG at the grasp and at the place pose, shapes (4, 4), and X_OG."""
         X_pick = raise_pose(downward_pose(yaw, grasp.p_TG), self._config.lip_gap)
@@ -255,32 +131,21 @@ class PickPlaceSearch:
 
     def _pick_endpoint(self, X_OG: RigidTransform, q: Floats) -> EndpointContext | None:
         """Return the endpoint at the pick pose, or None if the arm is in collision there."""
-        self._set_up_segment("approach", X_OG)
+        self._segments.set_up_segment("approach", X_OG)
         p_TG_xy = (self._X_TO @ _to_matrix(X_OG))[:2, 3]
         context = EndpointContext(p_TG_xy, {})
-        if self._min_distance_along(q[None], context, 1, "at the grasp") is None:
+        if self._segments.min_distance_along(q[None], context, 1, "at the grasp") is None:
             return None
-        self._set_up_segment("carry", X_OG)
-        return EndpointContext(p_TG_xy, self._contact_distances(q))
+        self._segments.set_up_segment("carry", X_OG)
+        return EndpointContext(p_TG_xy, self._segments.contact_distances(q))
 
     def _place_endpoint(self, X_OG: RigidTransform, q: Floats) -> EndpointContext | None:
         """Return the endpoint at the place pose, or None in collision."""
-        self._set_up_segment("carry", X_OG)
+        self._segments.set_up_segment("carry", X_OG)
         p_TG_xy = (self._X_TO_place @ _to_matrix(X_OG))[:2, 3]
-        context = EndpointContext(p_TG_xy, self._contact_distances(q))
-        distance = self._min_distance_along(q[None], context, 2, "at the place")
+        context = EndpointContext(p_TG_xy, self._segments.contact_distances(q))
+        distance = self._segments.min_distance_along(q[None], context, 2, "at the place")
         return None if distance is None else context
-
-    def _contact_distances(self, q: Floats) -> dict[str, float]:
-        """Return the allowed distances to neighbors of the attached object, by name [m]."""
-        name = self._picked.name
-        distances = self._collision_model.distances_below(q, self._config.min_distance)
-        of_object = [distance for distance in distances if distance.pair[0] == name]
-        # A neighbor may have several geometries: the smallest distance is the last and is kept.
-        return {
-            distance.pair[1]: distance.distance - CONTACT_TOLERANCE
-            for distance in sorted(of_object, key=lambda distance: -distance.distance)
-        }
 
     def has_candidate(self, grasp: Grasp) -> bool:
         """Return whether a grasp reaches both endpoints without collision."""
@@ -320,13 +185,13 @@ class PickPlaceSearch:
             height = bottom + gripper_height
             carry_path = self._tool.carry_path(X_pick, X_place, height, q_pick, q_place)
             if isinstance(carry_path, str):
-                self.record_failure(3, PlanningFailureReason.UNREACHABLE, carry_path, height)
+                self.failures.record(3, PlanningFailureReason.UNREACHABLE, carry_path, height)
                 return None
             q_end = carry_path.reversed_lowering[0]
             if not ends_at_q_place and (place := self._place_endpoint(X_OG, q_end)) is None:
                 continue
             assert place is not None
-            segments = self._plan_segments(grasp, X_OG, carry_path, (pick, place))
+            segments = self._segments.plan_segments(grasp, X_OG, carry_path, (pick, place))
             if segments is not None:
                 return self._make_plan(X_OG, segments, q_end)
         return None
@@ -345,207 +210,5 @@ class PickPlaceSearch:
             segments=segments,
             num_attempts=self.num_attempts,
             planning_time=0.0,
-            guarded_descent=self._guarded_descent(X_OG, q_place),
+            guarded_descent=self._segments.plan_guarded_descent(X_OG, q_place),
         )
-
-    def _guarded_descent(self, X_OG: RigidTransform, q_place: Floats) -> Trajectory | None:
-        """Return the vertical descent from the place pose as far as the arm is free.
-
-        The attached object is ignored: it is expected to touch something.
-        """
-        X_place = self._X_TO_place @ _to_matrix(X_OG)
-        path = [q_place]
-        heights = np.arange(0.0, self._config.max_guarded_descent + 1e-9, _DESCENT_STEP)
-        self._set_up_segment("retreat", X_OG)
-        self._collision_model.set_object_pose(
-            self._picked.name, self._X_TO_goal.translated((0.0, 0.0, -10.0))
-        )
-        for previous, height in pairwise(heights):
-            X_TG = np.array([raise_pose(X_place, -previous), raise_pose(X_place, -height)])
-            step = self._tool.track(X_TG, path[-1])
-            context = EndpointContext(X_place[:2, 3], {})
-            if (
-                step is None
-                or self._min_distance_along(step[1:], context, 0, "the descent") is None
-            ):
-                break
-            path.append(step[1])
-        if len(path) == 1:
-            return None
-        return PiecewisePolynomial.FirstOrderHold(
-            heights[: len(path)] / DESCENT_SPEED, np.array(path).T
-        )
-
-    def _plan_segments(
-        self,
-        grasp: Grasp,
-        X_OG: RigidTransform,
-        carry_path: CarryPath,
-        endpoints: tuple[EndpointContext, EndpointContext],
-    ) -> tuple[TrajectorySegment, ...] | None:
-        """Return approach, carry and retreat, or None after recording a failure."""
-        empty = Payload()
-        lift = carry_path.lift
-        lowering = carry_path.reversed_lowering
-        paths_from_lift = self._tool.paths_home(lift[-1])
-        paths_from_lowering = self._tool.paths_home(lowering[-1])
-        # Candidate waypoints and payload of each segment, in the order of planning.
-        candidates = {
-            "carry": ([carry_path.waypoints], grasp.payload),
-            "approach": ([np.vstack([lift, home[1:]])[::-1] for home in paths_from_lift], empty),
-            "retreat": ([np.vstack([lowering, home[1:]]) for home in paths_from_lowering], empty),
-        }
-        segments = {}
-        for progress, (name, (paths, payload)) in enumerate(candidates.items(), start=4):
-            attempts = (
-                self._plan_segment(name, waypoints, payload, X_OG, endpoints, progress)
-                for waypoints in paths
-            )
-            segment = next((attempt for attempt in attempts if attempt), None)
-            if segment is None:
-                return None
-            segments[name] = segment
-        if self._config.optimize:
-            segments = {
-                name: self._optimize_segment(segments[name], payload, X_OG, endpoints)
-                for name, (_, payload) in candidates.items()
-            }
-        return segments["approach"], segments["carry"], segments["retreat"]
-
-    def _plan_segment(
-        self,
-        name: str,
-        waypoints: Floats,
-        payload: Payload,
-        X_OG: RigidTransform,
-        endpoints: tuple[EndpointContext, EndpointContext],
-        progress: int,
-    ) -> TrajectorySegment | None:
-        """Return the segment along waypoints, or None after recording a failure."""
-        path = bspline_path(waypoints)
-        min_distance = self._check_segment(name, path, X_OG, endpoints, progress)
-        if min_distance is None:
-            return None
-        trajectory = parameterize_time_optimal(path, self._cell, payload)
-        if trajectory is None:
-            self.record_failure(progress, PlanningFailureReason.TRAJECTORY_INFEASIBLE, name)
-            return None
-        return TrajectorySegment(name, trajectory, min_distance, trajectory.end_time())
-
-    def _set_up_segment(self, segment_name: str, X_OG: RigidTransform) -> None:
-        """Set the pose of the picked object in the collision model for a segment."""
-        name = self._picked.name
-        X_TO = self._X_TO_goal if segment_name == "retreat" else self._picked.X_TO
-        self._collision_model.detach_object()
-        self._collision_model.set_object_pose(name, X_TO)
-        if segment_name == "carry":
-            self._collision_model.attach_object(name, X_OG)
-
-    def _check_segment(
-        self,
-        segment_name: str,
-        path: Trajectory,
-        X_OG: RigidTransform,
-        endpoints: tuple[EndpointContext, EndpointContext],
-        progress: int,
-        spacing: float = MAX_JOINT_STEP / 2,
-    ) -> SignedDistance | None:
-        """Return the smallest distance along a path, or None after recording a failure.
-
-        Args:
-            segment_name: `approach`, `carry` or `retreat`.
-            path: Path or trajectory in joint space.
-            X_OG: Grasp.
-            endpoints: Pick and place endpoint.
-            progress: Stage of planning, see `record_failure`.
-            spacing: Distance between checked configurations [rad].
-        """
-        self._set_up_segment(segment_name, X_OG)
-        points = sample_path(path, spacing)
-        if segment_name == "carry" and self._exceeds_tilt(points, progress):
-            return None
-        if segment_name != "carry":
-            context = self._arm_context(segment_name, endpoints)
-            return self._min_distance_along(points, context, progress, segment_name)
-        half = len(points) // 2
-        from_pick = self._min_distance_along(points[:half], endpoints[0], progress, segment_name)
-        if from_pick is None:
-            return None
-        to_place = self._min_distance_along(points[half:], endpoints[1], progress, segment_name)
-        if to_place is None:
-            return None
-        return min((from_pick, to_place), key=lambda distance: distance.distance)
-
-    @staticmethod
-    def _arm_context(
-        segment_name: str, endpoints: tuple[EndpointContext, EndpointContext]
-    ) -> EndpointContext:
-        """Return the endpoint of a segment on which no object is attached."""
-        endpoint = endpoints[1] if segment_name == "retreat" else endpoints[0]
-        return EndpointContext(endpoint.p_TG_xy, {})
-
-    def _exceeds_tilt(self, path: Floats, progress: int) -> bool:
-        """Return whether the tilt exceeds `MAX_CARRY_TILT`, and record that failure.
-
-        Paths of robots with `vertical_tool_rows` do not tilt the gripper.
-
-        Args:
-            path: Configurations. Shape (m, n).
-            progress: Stage of planning, see `record_failure`.
-        """
-        if self._robot.vertical_tool_rows is not None:
-            return False
-        tilt = float(np.linalg.norm(self._tool.axis(path)[:, :2], axis=1).max())
-        if tilt > MAX_CARRY_TILT:
-            self.record_failure(
-                progress, PlanningFailureReason.TRAJECTORY_INFEASIBLE, "carry", tilt
-            )
-        return tilt > MAX_CARRY_TILT
-
-    def _optimize_segment(
-        self,
-        segment: TrajectorySegment,
-        payload: Payload,
-        X_OG: RigidTransform,
-        endpoints: tuple[EndpointContext, EndpointContext],
-    ) -> TrajectorySegment:
-        """Return a faster trajectory of a segment, or the segment itself if none is found."""
-        self._set_up_segment(segment.name, X_OG)
-        min_distance = self._config.min_distance + OPTIMIZATION_MARGIN
-        is_carry = segment.name == "carry"
-        arm_context = self._arm_context(segment.name, endpoints)
-
-        def nearby_distances(q: Floats, s: float) -> list[LinearizedDistance]:
-            context = endpoints[int(s >= 0.5)] if is_carry else arm_context
-            linearized = []
-            for distance, gradient in self._collision_model.distances_and_gradients(
-                q, INFLUENCE_DISTANCE
-            ):
-                required = self._required_distance(distance, context, min_distance)
-                # Distances between neighboring wrist links are constant.
-                if np.abs(gradient).max() > 1e-6:
-                    linearized.append(LinearizedDistance(gradient, distance.distance - required))
-            return linearized
-
-        problem = TrajectoryOptimizationProblem(
-            initial_trajectory=segment.trajectory,
-            robot=self._robot,
-            vertical_start=segment.name != "approach",
-            vertical_end=segment.name != "retreat",
-            keep_tool_vertical=is_carry,
-            max_tool_acceleration=payload.max_axis_acceleration,
-            nearby_distances=nearby_distances,
-            tool_jacobian=self._collision_model.gripper_jacobian,
-            tool_axis=self._tool.axis,
-        )
-        optimized = optimize_trajectory(problem)
-        trajectory = scale_to_limits(optimized, self._cell, payload) if optimized else None
-        if trajectory is None or trajectory.end_time() >= segment.unoptimized_duration:
-            return segment
-        # Optimized paths pass obstacles closely: the check is denser than that of the initial path.
-        closest = self._check_segment(
-            segment.name, trajectory, X_OG, endpoints, 0, MAX_JOINT_STEP / 4
-        )
-        if closest is None:
-            return segment
-        return TrajectorySegment(segment.name, trajectory, closest, segment.unoptimized_duration)
