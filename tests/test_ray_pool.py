@@ -7,94 +7,37 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TypeVar
 
-import numpy as np
 import pytest
 import ray
 from conftest import DEFAULT_CELL
-from numpy.typing import NDArray
 from ray.cluster_utils import Cluster
+from ray_workers import (
+    ItemNumbers,
+    RandomNumbers,
+    broken_factory,
+    make_environment_reader,
+    make_failing_worker,
+    make_sleeper,
+    wait_for,
+)
 from test_cli import ABOVE, BELOW, broken, read_scene_files, run
-from test_workers import broken_factory, failing_worker
 
 from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.scenes.scene_file import save_scene
-from drake_clutter.seeding import item_rng
 from drake_clutter.workers.parallel_map import map_ordered
-
-ItemNumbers = tuple[int, NDArray[np.float64]]
-Found = TypeVar("Found")
-
-
-@dataclass(frozen=True)
-class RandomNumbers:
-    """Return so many random numbers that Ray transfers them in shared memory.
-
-    Attributes:
-        started: Folder that gets a file for every item that was started.
-        deadly: Items that kill their process at the first attempt.
-        deadliest: Item that kills its process at every attempt.
-        trap: Node on which an item takes a minute; then the folder contains the file "sprung". The
-            other node waits for that.
-    """
-
-    started: Path
-    deadly: tuple[int, ...] = ()
-    deadliest: int | None = None
-    trap: str | None = None
-
-    def __call__(self, item: int) -> ItemNumbers:
-        is_first_attempt = not (self.started / f"{item}").exists()
-        (self.started / f"{item}").touch()
-        time.sleep(0.1 if item % 4 == 0 else 0.0)
-        if (item in self.deadly and is_first_attempt) or item == self.deadliest:
-            os.kill(os.getpid(), signal.SIGKILL)
-        if self.trap is not None:
-            sprung = self.started / "sprung"
-            if ray.get_runtime_context().get_node_id() == self.trap:
-                sprung.touch()
-                time.sleep(60.0)
-            wait_for(sprung.exists)
-        return item, item_rng(7, item).normal(size=20_000)
 
 
 def to_bytes(results: Iterable[ItemNumbers]) -> list[tuple[int, bytes]]:
     return [(item, numbers.tobytes()) for item, numbers in results]
-
-
-def read_environment(file: str) -> tuple[int, str, str | None]:
-    return os.getpid(), Path(file).read_text(), os.environ.get("OPENBLAS_NUM_THREADS")
-
-
-def make_environment_reader() -> Callable[[str], tuple[int, str, str | None]]:
-    return read_environment
-
-
-def sleep(seconds: float) -> int:
-    time.sleep(seconds)
-    return os.getpid()
-
-
-def make_sleeper() -> Callable[[float], int]:
-    return sleep
-
-
-def wait_for(condition: Callable[[], Found]) -> Found:
-    deadline = time.monotonic() + 240  # Starting a worker may take a minute.
-    while not (found := condition()):
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    return found
 
 
 def busy_worker_processes(cluster: Cluster) -> list[int]:
@@ -220,7 +163,7 @@ def test_generate_writes_the_same_scenes_when_a_worker_is_killed(
 
 def test_exceptions_are_raised_unchanged_in_the_order_of_items(cluster: Cluster) -> None:
     results = map_ordered(
-        partial(failing_worker, 3), range(10), workers=2, ray_address=cluster.address
+        partial(make_failing_worker, 3), range(10), workers=2, ray_address=cluster.address
     )
     assert [next(results) for _ in range(3)] == [0, 1, 2]
     with pytest.raises(LookupError, match=r"^item 3$"):
@@ -267,7 +210,8 @@ def test_closing_early_ends_the_workers(cluster: Cluster) -> None:
 def test_ctrl_c_ends_the_workers(cluster: Cluster) -> None:
     code = f"""
 import signal
-from test_ray_pool import make_sleeper, map_ordered
+from ray_workers import make_sleeper
+from drake_clutter.workers.parallel_map import map_ordered
 # A background process of a shell ignores SIGINT by default.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 address = "{cluster.address}"
