@@ -22,6 +22,7 @@ import trimesh
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
+from drake_clutter.built_mesh import read_mesh_measures, read_surface
 from drake_clutter.files import InputError, format_value, input_error
 from drake_clutter.mesh_file import load_object_mesh
 from drake_clutter.resources import resource_path
@@ -250,6 +251,10 @@ class ObjectClass:
     def surface_triangles(self) -> NDArray[np.float64]:
         """Corners of the triangles of a mesh's surface in O [m]. Shape (F, 3, 3)."""
         assert self.mesh is not None, f"class {self.name} is not a mesh"
+        if read_mesh_measures(self.folder, self.mesh) is not None:
+            surface = read_surface(self.folder)
+            if surface is not None:
+                return surface
         where = f"{catalog_path(self.folder.parent)}: classes.{self.name}.mesh"
         return np.asarray(load_object_mesh(self.mesh, where).solid.triangles, float)
 
@@ -290,8 +295,12 @@ def _make_object_class(name: str, entry: ClassEntry, folder: Path, where: str) -
     """Return the class of an entry of a catalog."""
     mesh = folder / entry.mesh if entry.mesh else None
     if mesh is not None:
-        extents = load_object_mesh(mesh, f"{where}.mesh").solid.extents
-        size = (float(extents[0]), float(extents[1]), float(extents[2]))
+        measures = read_mesh_measures(folder / name, mesh)
+        if measures is not None:
+            size = measures.extents
+        else:
+            extents = load_object_mesh(mesh, f"{where}.mesh").solid.extents
+            size = (float(extents[0]), float(extents[1]), float(extents[2]))
     else:
         assert entry.size_mm is not None
         x, y, z = (s / 1000 for s in entry.size_mm)

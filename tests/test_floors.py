@@ -11,7 +11,7 @@ import drake_clutter
 PACKAGE = Path(drake_clutter.__file__).parent
 FLOORS = {
     0: {
-        *("assets", "catalog", "compilation", "files", "learning", "limits"),
+        *("assets", "built_mesh", "catalog", "compilation", "files", "learning", "limits"),
         *("mesh_file", "records", "resources", "seeding", "statistics"),
         *("validation", "workers", "yaml_io"),
     },

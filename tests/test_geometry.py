@@ -1,14 +1,30 @@
 """Penetration depth against closed forms, Drake and sampled points; touching groups."""
 
+# trimesh is typed in part only.
+# mypy: allow-untyped-calls
+
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from conftest import CLASSES, TRAY, resting, rng
 from numpy.typing import NDArray
+from pydrake.geometry import (
+    Convex,
+    FramePoseVector,
+    GeometryFrame,
+    GeometryInstance,
+    ProximityProperties,
+    SceneGraph,
+)
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation
 
+from drake_clutter.assets import build_assets
+from drake_clutter.catalog import ObjectClass, load_catalog
 from drake_clutter.grammar import Orientation
 from drake_clutter.scenes.geometry import (
     group_touching_objects,
@@ -179,6 +195,65 @@ def test_boxes_turned_any_way_against_drake(names: tuple[str, str]) -> None:
         else:
             apart += 1
     assert min(overlapping, apart) > 20
+
+
+def many_cornered(radii: tuple[float, float, float], folder: Path) -> ObjectClass:
+    """Return the class of an ellipsoid of 128 corners."""
+    name = "ellipsoid"
+    shape = trimesh.creation.icosphere(3)
+    shape.apply_scale(radii)
+    shape.export(folder / "ellipsoid.stl")
+    (folder / "catalog.yaml").write_text(
+        f"classes: {{{name}: {{shape: mesh, mesh: ellipsoid.stl, mass_g: 100}}}}"
+    )
+    build_assets(folder)
+    return load_catalog(folder).classes[name]
+
+
+def test_pieces_of_many_corners_against_drake(tmp_path: Path) -> None:
+    """Drake's depth of convex hulls comes from GJK and EPA, which end within a tolerance."""
+    ellipsoid = many_cornered((0.04, 0.03, 0.05), tmp_path)
+    scene_graph = SceneGraph()
+    source = scene_graph.RegisterSource("test")
+    frames = [scene_graph.RegisterFrame(source, GeometryFrame(name)) for name in ("a", "b")]
+    for frame in frames:
+        shape = Convex(str(ellipsoid.folder / "convex_000.obj"), 1.0)
+        instance = GeometryInstance(RigidTransform(), shape, "hull")
+        instance.set_proximity_properties(ProximityProperties())
+        scene_graph.RegisterGeometry(source, frame, instance)
+    context = scene_graph.CreateDefaultContext()
+    generator = rng(3)
+    overlapping = 0
+    for _ in range(60):
+        objects = []
+        poses = FramePoseVector()
+        for frame in frames:
+            rotation = Rotation.random(rng=generator).as_matrix()
+            translation = generator.uniform(0, 0.085, 3)
+            X_TO = Pose.from_rotation(rotation, translation)
+            objects.append(SceneObject("a", ellipsoid, X_TO))
+            poses.set_value(frame, RigidTransform(RotationMatrix(X_TO.rotation), translation))
+        scene_graph.get_source_pose_port(source).FixValue(context, poses)
+        query = scene_graph.get_query_output_port().Eval(context)
+        (pair,) = query.ComputeSignedDistancePairwiseClosestPoints()
+        depth = both_ways(*objects)
+        if pair.distance < 0:
+            overlapping += 1
+            assert depth == pytest.approx(-pair.distance, abs=2e-6)
+        else:
+            assert -pair.distance - 1e-9 <= depth <= 0
+    assert 20 < overlapping < 58
+
+
+def test_two_balls(tmp_path: Path) -> None:
+    """Hulls of 128 corners lie at most 3.5 % of the radius below the spheres."""
+    radius = 0.04
+    ball = many_cornered((radius, radius, radius), tmp_path)
+    generator = rng(4)
+    for distance in (0.05, 0.07, 0.079, 0.085):
+        X_TO = Pose.from_rotation(Rotation.random(rng=generator).as_matrix(), (distance, 0, 0))
+        depth = both_ways(SceneObject("a", ball, Pose((0, 0, 0))), SceneObject("b", ball, X_TO))
+        assert 2 * radius - distance - 2 * 0.035 * radius <= depth <= 2 * radius - distance + 1e-9
 
 
 @pytest.mark.parametrize(

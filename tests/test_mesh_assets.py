@@ -12,10 +12,13 @@ import trimesh
 from conftest import rng, scene_of
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.spatial import ConvexHull
 from test_mesh_file import SIZE, write_cube_with_seams, write_two_materials
 from typer.testing import CliRunner
 
 from drake_clutter.assets import build_assets
+from drake_clutter.assets.convex_pieces import MAX_PIECE_CORNERS, measure_deviation
+from drake_clutter.built_mesh import read_mesh_measures
 from drake_clutter.catalog import ObjectClass, load_catalog
 from drake_clutter.cli.app import app
 from drake_clutter.config import ClutterConfig
@@ -184,3 +187,72 @@ def test_a_damaged_model_is_refused(tmp_path: Path) -> None:
     own.sdf_path.write_text("<sdf><model>")
     with pytest.raises(InputError, match=r"model\.sdf: cannot be read"):
         _ = own.verified_sdf_path
+
+
+def test_a_ball_has_a_bounded_number_of_corners(tmp_path: Path) -> None:
+    """The hull of 128 of 642 corners lies within the ball, at most 3.5 % of the radius below it."""
+    radius = 0.04
+    trimesh.creation.icosphere(3, radius).export(tmp_path / "ball.stl")
+    ball = own_class(tmp_path, "ball.stl")
+    (corners,) = ball.convex_pieces
+    assert len(corners) == MAX_PIECE_CORNERS
+    assert np.linalg.norm(corners, axis=1) == pytest.approx(radius, abs=1e-6)
+    assert np.ptp(corners, axis=0) == pytest.approx(ball.size, abs=1e-6)
+    assert ball.mesh is not None
+    measures = read_mesh_measures(ball.folder, ball.mesh)
+    assert measures is not None
+    # The lowest plane of the hull is the deepest place of its surface.
+    depth = radius + float(ConvexHull(corners).equations[:, 3].max())
+    assert measures.max_bulge < 1e-4  # the flat triangles of the icosphere
+    assert 0.5 * depth < measures.max_recess <= depth < 0.035 * radius
+
+
+def test_a_scanned_box_is_one_piece(tmp_path: Path) -> None:
+    """Noise of 0.1 mm is below the depth up to which a mesh counts as convex."""
+    box = trimesh.creation.box(SIZE)
+    for _ in range(3):
+        box = box.subdivide()
+    box.vertices += rng(0).normal(0, 1e-4, (len(box.vertices), 3))
+    box.export(tmp_path / "box.ply")
+    own = own_class(tmp_path, "box.ply")
+    (corners,) = own.convex_pieces
+    assert len(corners) <= MAX_PIECE_CORNERS
+    assert own.size == pytest.approx(SIZE, abs=1e-3)
+
+
+@pytest.mark.parametrize(("margin", "expected"), [(0.001, (3**0.5, 0)), (-0.001, (0, 3**0.5))])
+def test_deviation_of_a_box_that_is_a_millimeter_larger_or_smaller_all_around(
+    margin: float, expected: tuple[float, float]
+) -> None:
+    """The largest distance is at the corners."""
+    mesh = trimesh.creation.box((0.04, 0.05, 0.06))
+    piece = trimesh.creation.box(np.array((0.04, 0.05, 0.06)) + 2 * margin)
+    deviation = np.array(measure_deviation(mesh, [piece]))
+    assert deviation == pytest.approx(np.array(expected) * 0.001, abs=1e-9)
+
+
+def test_a_built_mesh_is_not_read_again_unless_it_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "box.stl")
+    own_class(tmp_path, "box.stl")
+    with monkeypatch.context() as context:
+        context.setattr(trimesh, "load_scene", None)
+        load_catalog.cache_clear()
+        own = load_catalog(tmp_path).classes["own"]
+        assert own.size == pytest.approx((0.04, 0.05, 0.06))
+        assert np.ptp(own.surface_triangles.reshape(-1, 3), axis=0) == pytest.approx(own.size)
+    trimesh.creation.box((0.05, 0.05, 0.06)).export(tmp_path / "box.stl")
+    load_catalog.cache_clear()
+    assert load_catalog(tmp_path).classes["own"].size == pytest.approx((0.05, 0.05, 0.06))
+
+
+@pytest.mark.parametrize("name", ["mesh.json", "surface.npy"])
+def test_damaged_measures_of_a_mesh_are_not_used(tmp_path: Path, name: str) -> None:
+    trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "box.stl")
+    path = own_class(tmp_path, "box.stl").folder / name
+    path.write_bytes(path.read_bytes()[:-9])
+    load_catalog.cache_clear()
+    own = load_catalog(tmp_path).classes["own"]
+    assert own.size == pytest.approx((0.04, 0.05, 0.06))
+    assert own.surface_triangles.shape == (12, 3, 3)

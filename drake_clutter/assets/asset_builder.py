@@ -17,9 +17,17 @@ import trimesh
 from numpy.typing import NDArray
 
 from drake_clutter.assets.contact_properties import proximity_properties_sdf
+from drake_clutter.assets.convex_pieces import decompose_convex, measure_deviation, obj_text
 from drake_clutter.assets.mesh_appearance import has_appearance, textured_parts
 from drake_clutter.assets.textured_mesh import box_mesh, cylinder_mesh, gltf_text, map_strip_texture
 from drake_clutter.assets.textures import draw_texture, encode_png
+from drake_clutter.built_mesh import (
+    MEASURES_FILE,
+    SURFACE_FILE,
+    MeshMeasures,
+    hash_mesh_file,
+    read_mesh_measures,
+)
 from drake_clutter.catalog import (
     CATALOG_FILE,
     ObjectClass,
@@ -41,7 +49,7 @@ from drake_clutter.mesh_file import (
 from drake_clutter.resources import resource_path
 
 _SHIPPED_PACKAGE = "drake_clutter_objects"
-_BUILT_FILE = re.compile(r"model\.sdf|visual\.gltf|convex_\d{3}\.obj")
+_BUILT_FILE = re.compile(r"model\.sdf|visual\.gltf|convex_\d{3}\.obj|mesh\.json|surface\.npy")
 """Names of the files that a build writes."""
 _LYING_MESH_RESOLUTION = 0.2
 """Edge length of the contact mesh of a cylinder that may lie, in radii.
@@ -53,21 +61,6 @@ _STANDING_MESH_RESOLUTION = 0.4
 
 Its rim has 16 sides, which halves the simulation time of stacks of cans.
 """
-_COACD_OPTIONS = {
-    "threshold": 0.06,
-    "mcts_iterations": 20,
-    "mcts_nodes": 10,
-    "mcts_max_depth": 2,
-    "resolution": 1000,
-    "seed": 1,
-}
-"""Options of CoACD for few pieces, as every piece costs simulation time.
-
-With its default options, CoACD makes 48 pieces of the example's mug.
-"""
-_CONVEX_VOLUME_RATIO = 0.999
-"""A mesh whose volume is at least this fraction of its hull's counts as convex."""
-
 _PACKAGE_XML = """<?xml version="1.0"?>
 <package format="2">
   <name>{name}</name>
@@ -138,35 +131,6 @@ def _compute_inertial(object_class: ObjectClass, mesh: trimesh.Trimesh | None) -
         across = mass / 12 * (3 * radius**2 + z**2)
         moments = np.array([across, across, mass / 2 * radius**2])
     return _Inertial(np.zeros(3), np.diag(moments))
-
-
-def _decompose_convex(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
-    """Return convex hulls that cover a mesh; one for a convex mesh.
-
-    The decomposition is CoACD (Wei et al. 2022). Bodies are decomposed one by one, because CoACD
-    does not return for some meshes of separate bodies; a body with a cavity stays whole.
-    """
-    bodies = list(mesh.split(only_watertight=False))
-    if len(bodies) > 1 and all(body.volume > 0 for body in bodies):
-        return [piece for body in bodies for piece in _decompose_convex(body)]
-    if mesh.volume > _CONVEX_VOLUME_RATIO * mesh.convex_hull.volume:
-        return [mesh.convex_hull]
-    import coacd  # here, because it breaks Drake's SDF reader when loaded before Drake
-
-    coacd.set_log_level("error")
-    pieces = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), **_COACD_OPTIONS)
-    low, high = mesh.bounds
-    # Clipped, because objects are stacked on the bounding box. A piece that is flat afterwards has
-    # no volume, and is left out.
-    clipped = [np.clip(vertices, low, high) for vertices, _ in pieces]
-    return [trimesh.convex.convex_hull(points) for points in clipped if not is_flat(points)]
-
-
-def _obj_text(mesh: trimesh.Trimesh) -> str:
-    """Return a mesh as the content of an OBJ file."""
-    lines = ["v {:.7f} {:.7f} {:.7f}".format(*vertex) for vertex in mesh.vertices]
-    lines += ["f {} {} {}".format(*(face + 1)) for face in mesh.faces]
-    return "\n".join(lines) + "\n"
 
 
 def _collision_sdf(name: str, geometry: str, hint: float) -> str:
@@ -249,8 +213,8 @@ def _make_asset_files(object_class: ObjectClass, object_mesh: ObjectMesh | None)
     """Return the contents of every file of a class, by file name."""
     mesh = object_mesh.solid if object_mesh is not None else None
     texture = draw_texture(object_class)
-    pieces = _decompose_convex(mesh) if mesh is not None else []
-    files = {f"convex_{index:03d}.obj": _obj_text(piece) for index, piece in enumerate(pieces)}
+    pieces = decompose_convex(mesh) if mesh is not None else []
+    files = {f"convex_{index:03d}.obj": obj_text(piece) for index, piece in enumerate(pieces)}
     if object_mesh is not None and object_class.mesh and has_appearance(object_mesh):
         parts = textured_parts(object_mesh, object_class.mesh)
         files["visual.gltf"] = gltf_text(parts, repeat=True)
@@ -263,6 +227,16 @@ def _make_asset_files(object_class: ObjectClass, object_mesh: ObjectMesh | None)
             surface = cylinder_mesh(object_class.size, texture.regions)
         files["visual.gltf"] = gltf_text([(surface, encode_png(texture.image))])
     inertial = _compute_inertial(object_class, mesh)
+    if object_mesh is not None and object_class.mesh:
+        x, y, z = object_mesh.solid.extents.tolist()
+        max_bulge, max_recess = measure_deviation(object_mesh.solid, pieces)
+        files[MEASURES_FILE] = MeshMeasures(
+            sha256=hash_mesh_file(object_class.mesh),
+            extents=(x, y, z),
+            repairs=_repair_texts(object_mesh),
+            max_bulge=max_bulge,
+            max_recess=max_recess,
+        ).model_dump_json(indent=2)
     files["model.sdf"] = _MODEL_SDF.format(
         name=object_class.name,
         catalog=CATALOG_FILE,
@@ -368,6 +342,9 @@ def build_class(object_class: ObjectClass, folder: Path, *, repair: bool = False
     try:
         for name, text in files.items():
             (staging / name).write_text(text, encoding="utf-8")
+        if mesh is not None:
+            # Single precision, in which most mesh files store coordinates.
+            np.save(staging / SURFACE_FILE, np.asarray(mesh.solid.triangles, np.float32))
         shutil.rmtree(target, ignore_errors=True)
         os.replace(staging, target)
     finally:
@@ -375,12 +352,25 @@ def build_class(object_class: ObjectClass, folder: Path, *, repair: bool = False
     return target
 
 
-def mesh_repairs(object_class: ObjectClass) -> tuple[str, ...]:
-    """Return what a build repairs in the mesh of a class."""
+def _repair_texts(mesh: ObjectMesh) -> tuple[str, ...]:
+    """Return what a build repairs in a mesh."""
+    return mesh.repairs + tuple(f"closed {hole}" for hole in mesh.holes)
+
+
+def describe_built_mesh(object_class: ObjectClass) -> tuple[str, ...]:
+    """Return what a build repaired in the mesh of a class, and how its convex pieces deviate."""
     if object_class.mesh is None:
         return ()
-    mesh = load_object_mesh(object_class.mesh, _mesh_where(object_class))
-    return mesh.repairs + tuple(f"closed {hole}" for hole in mesh.holes)
+    measures = read_mesh_measures(object_class.folder, object_class.mesh)
+    if measures is None:
+        return ()
+    counts = [len(piece) for piece in object_class.convex_pieces]
+    number = f"{len(counts)} convex pieces" if len(counts) > 1 else "1 convex piece"
+    return (
+        *measures.repairs,
+        f"{number} of at most {max(counts)} corners, up to {1000 * measures.max_bulge:.2g} mm "
+        f"beyond and {1000 * measures.max_recess:.2g} mm behind the surface",
+    )
 
 
 def build_assets(

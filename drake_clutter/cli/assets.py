@@ -27,10 +27,10 @@ def build(
     ] = False,
 ) -> None:
     """Build the SDF models, collision geometry and textures of a catalog."""
-    from drake_clutter.assets import build_assets, mesh_repairs
+    from drake_clutter.assets import build_assets, describe_built_mesh
     from drake_clutter.catalog import load_catalog
 
     for built in build_assets(folder, classes, repair=repair):
         print_line(f"Built {built}.")
-        for text in mesh_repairs(load_catalog(folder.resolve()).classes[built.name]):
+        for text in describe_built_mesh(load_catalog(folder.resolve()).classes[built.name]):
             print_line(f"  Mesh: {text}.")

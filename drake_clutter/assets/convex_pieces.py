@@ -1,0 +1,193 @@
+"""Convex pieces of a mesh with a bounded number of corners, and how far they are from it."""
+
+# trimesh is typed in part only.
+# mypy: allow-untyped-calls
+
+from collections.abc import Sequence
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from pydrake.common import MemoryFile
+from pydrake.geometry import (
+    GeometryInstance,
+    InMemoryMesh,
+    Mesh,
+    ProximityProperties,
+    QueryObject,
+    SceneGraph,
+)
+from pydrake.math import RigidTransform
+from scipy.spatial import ConvexHull
+
+from drake_clutter.mesh_file import is_flat
+
+Floats = NDArray[np.float64]
+"""An array of floats."""
+
+MAX_PIECE_CORNERS = 128
+"""Largest number of corners of a convex piece.
+
+128 points on a sphere leave 2 % of its radius at most. The time of contact queries grows with the
+number of corners.
+"""
+SURFACE_TOLERANCE = 0.0002
+"""A piece gets no more corners once its surface is moved by less than this [m]."""
+MAX_DENT = 0.001
+"""A mesh that lies nowhere deeper than this below its convex hull counts as convex [m].
+
+It exceeds the noise of scanners, which is a few tenths of a millimeter.
+"""
+_MAX_DENT_FRACTION = 0.02
+"""Largest such depth as a fraction of the smallest extent, so that a thin plate keeps its rim."""
+_CONVEX_VOLUME_RATIO = 0.999
+"""A mesh whose volume is at least this fraction of its hull's counts as convex."""
+_COACD_OPTIONS = {
+    "threshold": 0.06,
+    "mcts_iterations": 20,
+    "mcts_nodes": 10,
+    "mcts_max_depth": 2,
+    "resolution": 1000,
+    "seed": 1,
+}
+"""Options of CoACD for few pieces, as every piece costs simulation time.
+
+With its default options, CoACD makes 48 pieces of the example's mug.
+"""
+_NUM_EXACT_DISTANCES = 200
+"""Number of vertices farthest outside of all pieces whose distance is computed exactly."""
+
+
+def obj_text(mesh: trimesh.Trimesh) -> str:
+    """Return a mesh as the content of an OBJ file."""
+    lines = ["v {:.7f} {:.7f} {:.7f}".format(*vertex) for vertex in mesh.vertices]
+    lines += ["f {} {} {}".format(*(face + 1)) for face in mesh.faces]
+    return "\n".join(lines) + "\n"
+
+
+def _excess(hull: ConvexHull, points: Floats) -> Floats:
+    """Return how far points (N, 3) are beyond the planes of a hull [m]; negative inside."""
+    excess = np.full(len(points), -np.inf)
+    for start in range(0, len(points), 4096):  # a group of rows keeps the memory small
+        part = points[start : start + 4096] @ hull.equations[:, :3].T + hull.equations[:, 3]
+        excess[start : start + 4096] = part.max(axis=1)
+    return excess
+
+
+def _first_corners(points: Floats) -> list[int]:
+    """Return the indices of a tetrahedron's corners and of the extreme points along the axes."""
+    first = int(points[:, 0].argmin())
+    second = int(np.linalg.norm(points - points[first], axis=1).argmax())
+    arms = points - points[first]
+    area = np.linalg.norm(np.cross(arms, arms[second]), axis=1)
+    third = int(area.argmax())
+    fourth = int(np.abs(arms @ np.cross(arms[second], arms[third])).argmax())
+    extremes = [*points.argmin(axis=0).tolist(), *points.argmax(axis=0).tolist()]
+    return list(dict.fromkeys([first, second, third, fourth, *extremes]))
+
+
+def bounded_hull(points: Floats) -> trimesh.Trimesh:
+    """Return a convex hull with at most `MAX_PIECE_CORNERS` corners.
+
+    Of a hull with more corners, the corner farthest outside is added until the number or
+    `SURFACE_TOLERANCE` is reached. The result lies within the hull and has its bounding box.
+
+    Args:
+        points: Points that do not lie in a plane [m]. Shape (N, 3).
+    """
+    full: trimesh.Trimesh = trimesh.convex.convex_hull(points)
+    corners = np.asarray(full.vertices, float)
+    if len(corners) <= MAX_PIECE_CORNERS:
+        return full
+    chosen = _first_corners(corners)
+    hull = ConvexHull(corners[chosen], incremental=True)
+    while len(chosen) < MAX_PIECE_CORNERS:
+        excess = _excess(hull, corners)
+        farthest = int(excess.argmax())
+        if excess[farthest] < SURFACE_TOLERANCE:
+            break
+        chosen.append(farthest)
+        hull.add_points(corners[[farthest]])
+    hull.close()
+    bounded: trimesh.Trimesh = trimesh.convex.convex_hull(corners[chosen])
+    return bounded
+
+
+def _is_convex(mesh: trimesh.Trimesh) -> bool:
+    """Return whether a mesh is convex but for noise."""
+    if mesh.volume > _CONVEX_VOLUME_RATIO * mesh.convex_hull.volume:
+        return True
+    hull = ConvexHull(bounded_hull(mesh.vertices).vertices)
+    # Dents of triangles that span a groove are at their centers.
+    points = np.vstack([mesh.vertices, mesh.triangles_center])
+    max_dent = min(MAX_DENT, _MAX_DENT_FRACTION * mesh.extents.min())
+    return bool(_excess(hull, points).min() > -max_dent)
+
+
+def decompose_convex(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
+    """Return convex hulls that cover a mesh; one for a convex mesh.
+
+    The decomposition is CoACD (Wei et al. 2022). Bodies are decomposed one by one, because CoACD
+    does not return for some meshes of separate bodies; a body with a cavity stays whole. Every hull
+    has at most `MAX_PIECE_CORNERS` corners.
+    """
+    bodies = list(mesh.split(only_watertight=False))
+    if len(bodies) > 1 and all(body.volume > 0 for body in bodies):
+        return [piece for body in bodies for piece in decompose_convex(body)]
+    if _is_convex(mesh):
+        return [bounded_hull(mesh.vertices)]
+    import coacd  # here, because it breaks Drake's SDF reader when loaded before Drake
+
+    coacd.set_log_level("error")
+    pieces = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), **_COACD_OPTIONS)
+    low, high = mesh.bounds
+    # Clipped, because objects are stacked on the bounding box. A piece that is flat afterwards has
+    # no volume, and is left out.
+    clipped = [np.clip(vertices, low, high) for vertices, _ in pieces]
+    return [bounded_hull(points) for points in clipped if not is_flat(points)]
+
+
+def _distance_query(mesh: trimesh.Trimesh) -> tuple[SceneGraph, QueryObject]:
+    """Return Drake's query of distances to a closed mesh, with the geometry that it needs."""
+    scene_graph = SceneGraph()
+    file = MemoryFile(obj_text(mesh), ".obj", "mesh")
+    shape = Mesh(InMemoryMesh(mesh_file=file), 1.0)
+    instance = GeometryInstance(RigidTransform(), shape, "mesh")
+    instance.set_proximity_properties(ProximityProperties())
+    scene_graph.RegisterAnchoredGeometry(scene_graph.RegisterSource("mesh"), instance)
+    context = scene_graph.CreateDefaultContext()
+    return scene_graph, scene_graph.get_query_output_port().Eval(context)
+
+
+def measure_deviation(
+    mesh: trimesh.Trimesh, pieces: Sequence[trimesh.Trimesh]
+) -> tuple[float, float]:
+    """Return how far convex pieces bulge beyond a mesh, and recede behind it [m].
+
+    The bulge is measured at the corners, the edges' midpoints and the centers of the faces of the
+    pieces, the recess at the vertices of the mesh.
+
+    Args:
+        mesh: A closed mesh.
+        pieces: Convex pieces that cover it.
+    """
+    _scene_graph, query = _distance_query(mesh)
+    bulge = 0.0
+    recess = np.full(len(mesh.vertices), np.inf)
+    for piece in pieces:
+        edges = piece.vertices[piece.edges_unique].mean(axis=1)
+        for point in np.vstack([piece.vertices, edges, piece.triangles_center]):
+            bulge = max(bulge, query.ComputeSignedDistanceToPoint(point)[0].distance)
+        recess = np.minimum(recess, _excess(ConvexHull(piece.vertices), mesh.vertices))
+    # The excess over planes is at most the distance, so the largest ones are computed exactly.
+    farthest = np.argsort(recess)[-_NUM_EXACT_DISTANCES:]
+    outside = mesh.vertices[farthest[recess[farthest] > 0]]
+    triangles = np.vstack([piece.triangles for piece in pieces])
+    distances = [
+        np.linalg.norm(
+            trimesh.triangles.closest_point(triangles, np.tile(point, (len(triangles), 1))) - point,
+            axis=1,
+        ).min()
+        for point in outside
+    ]
+    return bulge, float(max(distances, default=0.0))

@@ -1,0 +1,73 @@
+"""What a build found out about a user's mesh, so that large meshes are not read again.
+
+The folder of a built class holds `mesh.json` and `surface.npy`. They count only as long as the mesh
+file is the one from which they were built.
+"""
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_clutter.validation import StrictModel
+
+MEASURES_FILE = "mesh.json"
+SURFACE_FILE = "surface.npy"
+
+
+class MeshMeasures(StrictModel):
+    """Measures of a mesh, which `mesh.json` holds.
+
+    Attributes:
+        sha256: Hash of the mesh file, see `hash_mesh_file`.
+        extents: Extents of the bounding box [m]. Shape (3,).
+        repairs: What the build repaired.
+        max_bulge: Largest distance of the convex pieces beyond the surface [m].
+        max_recess: Largest distance of the convex pieces behind the surface [m].
+    """
+
+    sha256: str
+    extents: tuple[float, float, float]
+    repairs: tuple[str, ...]
+    max_bulge: float
+    max_recess: float
+
+
+def hash_mesh_file(path: Path) -> str:
+    """Return the SHA-256 of a mesh file, and of the geometry files beside it that a glTF names."""
+    content = path.read_bytes()
+    digest = hashlib.sha256(content)
+    if path.suffix.lower() == ".gltf":
+        for buffer in json.loads(content).get("buffers", []):
+            beside = path.parent / str(buffer.get("uri", ""))
+            if not str(buffer.get("uri", "")).startswith("data:") and beside.is_file():
+                digest.update(beside.read_bytes())
+    return digest.hexdigest()
+
+
+def read_mesh_measures(folder: Path, mesh: Path) -> MeshMeasures | None:
+    """Return the measures in the folder of a built class; None if they are not those of the mesh.
+
+    Args:
+        folder: The folder of the class.
+        mesh: The mesh file.
+    """
+    try:
+        text = (folder / MEASURES_FILE).read_text(encoding="utf-8")
+        measures = MeshMeasures.model_validate_json(text)
+        return measures if measures.sha256 == hash_mesh_file(mesh) else None
+    except (OSError, ValueError):
+        return None
+
+
+def read_surface(folder: Path) -> NDArray[np.float64] | None:
+    """Return the triangles of a built mesh in O [m], shape (F, 3, 3); None if there are none."""
+    try:
+        triangles = np.load(folder / SURFACE_FILE)
+    except (OSError, ValueError, EOFError):
+        return None
+    if triangles.ndim != 3 or triangles.shape[1:] != (3, 3) or not np.isfinite(triangles).all():
+        return None
+    return np.asarray(triangles, float)
