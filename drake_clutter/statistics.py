@@ -3,14 +3,17 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import binomtest, norm, sem
+from numpy.typing import NDArray
+from scipy.integrate import quad
+from scipy.optimize import brentq
+from scipy.stats import binomtest
 
 CONFIDENCE_LEVEL = 0.95
 """Probability that an interval contains the true value."""
 QUANTILES = (0.025, 0.975)
 """Quantiles between which an interval extends."""
-NUM_RESAMPLES = 2000
-"""Number of bootstrap samples."""
+RATIO_TOLERANCE = 1e-7
+"""Error of the bounds of a mean or ratio, as a fraction of its range."""
 
 
 def wilson_interval(successes: int, count: int) -> tuple[float, float]:
@@ -26,30 +29,97 @@ def wilson_interval(successes: int, count: int) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
-def mean_interval(values: Sequence[float]) -> tuple[float, float] | None:
-    """Return the interval of a mean by the normal approximation; None for fewer than two values."""
-    if len(values) < 2:
-        return None
-    half_width = float(norm.ppf(QUANTILES[1]) * sem(values))
-    mean = float(np.mean(values))
-    return mean - half_width, mean + half_width
+def mean_interval(values: Sequence[float], low: float, high: float) -> tuple[float, float] | None:
+    """Return Gaffke's interval of the mean of a bounded quantity (Gaffke 2005).
 
-
-def bootstrap_ratio_interval(
-    numerators: Sequence[float], denominators: Sequence[float]
-) -> tuple[float, float]:
-    """Return the percentile bootstrap interval of a ratio of sums (Efron 1979).
-
-    Scenes are resampled with a constant seed. `scipy.stats.bootstrap` would draw other samples, and
-    change the intervals of published results.
+    It holds for any number of values and any distribution between the bounds (proof: Vlassis and
+    Thomas 2026, arXiv:2607.08415), where the normal approximation is far too narrow for few values.
+    For values of 0 and 1 it is the interval of Clopper and Pearson (1934).
 
     Args:
-        numerators: Summand of each scene in the numerator.
-        denominators: Summand of each scene in the denominator.
+        values: Independent values from `low` to `high`.
+        low: Smallest possible value, which must not be chosen from the values.
+        high: Largest possible value, likewise.
+
+    Returns:
+        The interval; None without values.
     """
-    num_scenes = len(numerators)
-    resampled = np.random.default_rng(0).integers(num_scenes, size=(NUM_RESAMPLES, num_scenes))
-    numerator = np.asarray(numerators)[resampled].sum(axis=1)
-    denominator = np.asarray(denominators)[resampled].sum(axis=1)
-    low, high = np.quantile(numerator / denominator, QUANTILES).tolist()
+    return ratio_interval(values, [1] * len(values), (low, 1), (high, 1))
+
+
+def ratio_interval(
+    numerators: Sequence[float],
+    denominators: Sequence[float],
+    lowest: tuple[float, float],
+    highest: tuple[float, float],
+) -> tuple[float, float] | None:
+    """Return Gaffke's interval of a ratio of two means; see `mean_interval`.
+
+    A ratio r is in the interval if the mean of `numerator - r * denominator` may be 0. The two
+    bounds are quantiles of the ratio with random weights of the pairs, uniform on the simplex,
+    where `lowest` or `highest` is one pair more.
+
+    Args:
+        numerators: Numerator of each pair; the pairs are independent.
+        denominators: Denominator of each pair, positive.
+        lowest: Possible pair for which `numerator - r * denominator` is smallest, for any r in
+            question.
+        highest: Possible pair for which it is largest.
+
+    Returns:
+        The interval; None without pairs.
+    """
+    if not len(numerators):
+        return None
+    pairs, counts = np.unique(
+        np.array([numerators, denominators], float), axis=1, return_counts=True
+    )
+    low, high = (
+        _weighted_ratio_quantile(np.column_stack([pairs, extreme]), np.append(counts, 1), quantile)
+        for extreme, quantile in zip((lowest, highest), QUANTILES, strict=True)
+    )
     return low, high
+
+
+def _weighted_ratio_quantile(
+    pairs: NDArray[np.float64], counts: NDArray[np.int_], quantile: float
+) -> float:
+    """Return a quantile of the ratio of two means with weights that are uniform on the simplex.
+
+    Args:
+        pairs: Different pairs of numerator and denominator. Shape (2, n).
+        counts: How often each pair occurs. Shape (n,).
+        quantile: Probability of a smaller ratio.
+    """
+    numerators, denominators = pairs
+    ratios = numerators / denominators
+    low, high = float(ratios.min()), float(ratios.max())
+    if low == high:
+        return low
+
+    def excess(ratio: float) -> float:
+        return _negative_sum_probability(numerators - ratio * denominators, counts) - quantile
+
+    return float(brentq(excess, low, high, xtol=RATIO_TOLERANCE * (high - low)))
+
+
+def _negative_sum_probability(scales: NDArray[np.float64], counts: NDArray[np.int_]) -> float:
+    """Return the probability that a sum of scaled exponential variables is negative.
+
+    Uniform weights on the simplex are proportional to independent exponential variables. The
+    characteristic function of the sum is inverted as by Imhof (1961, eq. 3.2), with two degrees of
+    freedom for each variable.
+
+    Args:
+        scales: Scales of the variables, some negative and some positive. Shape (n,).
+        counts: Number of variables of each scale. Shape (n,).
+    """
+    scales = scales / np.sqrt(counts @ scales**2)
+
+    def integrand(u: float) -> float:
+        angle = counts @ np.arctan(u * scales)
+        modulus = np.exp(-0.5 * (counts @ np.log1p((u * scales) ** 2)))
+        return float(np.sin(angle) * modulus / u)
+
+    integral, _ = quad(integrand, 0, np.inf, limit=500)
+    return float(0.5 - integral / np.pi)

@@ -12,6 +12,7 @@ from drake_clutter.agents.episode_evaluation import EpisodeResult
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
+from drake_clutter.statistics import mean_interval, ratio_interval
 from drake_clutter.validation import to_plain
 from training import evaluate_explorers as script
 from training.results_file import ResultsFile
@@ -45,7 +46,7 @@ def test_metrics_of_an_explorer() -> None:
         result(ALL_FOUND, 4, (4,)),
         result("gave up", 1, ()),
     ]
-    row = script.summarize(results, {"ceiling": ceiling})
+    row = script.summarize(results, {"ceiling": ceiling}, 5)
     assert row["hidden"] == 2.5
     assert (row["within_10"]["success"], row["within_20"]["success"]) == (0.25, 0.5)
     assert (row["within_10"]["found"], row["within_20"]["found"]) == (3 / 4, 6 / 4)
@@ -53,17 +54,19 @@ def test_metrics_of_an_explorer() -> None:
     assert row["within_10"]["collapsed"] == row["within_20"]["collapsed"] == 0.25
     assert row["moves_of_successes"] == 7
     assert row["not_carried_out"] == 3 / 36
-    low, high = row["moves_to_ceiling_ci95"]
-    assert (low, high) == (2 / 2, 12 / 2), (
-        "a bootstrap sample of two scenes holds either of them twice, or both"
+    assert row["within_10"]["found_ci95"] == mean_interval([2, 0, 1, 0], 0, 5)
+    assert row["within_20"]["found_of_hidden_ci95"] == ratio_interval(
+        [2, 3, 1, 0], [2, 3, 4, 1], (0, 5), (5, 5)
     )
+    assert row["moves_of_successes_ci95"] == mean_interval([2, 12], 1, 20)
+    assert row["moves_to_ceiling_ci95"] == ratio_interval([2, 12], [2, 2], (1, 20), (20, 1))
     assert (row["moves_to_ceiling"], row["both_with_ceiling"]) == (14 / 4, 2)
 
 
 @pytest.mark.parametrize(("moves", "in_10", "in_20"), [(10, 0.5, 0.5), (11, 0, 0.5), (20, 0, 0.5)])
 def test_the_last_move_counts(moves: int, in_10: float, in_20: float) -> None:
     results = [result(ended, 1, (0,) * (moves - 1) + (1,)) for ended in (ALL_FOUND, COLLAPSED)]
-    row = script.summarize(results, {})
+    row = script.summarize(results, {}, 5)
     metrics = {
         limit: [row[f"within_{limit}"][name] for name in ("success", "collapsed", "found")]
         for limit in (10, 20)

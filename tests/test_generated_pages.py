@@ -17,6 +17,7 @@ import results_closed_loop
 import results_exploration
 import results_generation
 import results_index
+import results_intervals
 import results_judge_agreement
 import results_negative
 import results_perception
@@ -33,6 +34,7 @@ RESULTS = {
         results_exploration,
         results_generation,
         results_index,
+        results_intervals,
         results_judge_agreement,
         results_negative,
         results_perception,
@@ -50,6 +52,14 @@ def rows_of(text: str, *cells: str) -> list[list[str]]:
         if line.startswith("| ")
     ]
     return [row for row in rows if row[: len(cells)] == list(cells)]
+
+
+def test_coverage_of_intervals() -> None:
+    """Of three values, the normal interval holds 0.05 if one or two are 1; Wilson's if none is."""
+    row = rows_of(results_intervals.page(), "0 or 1, p = 0.05", "3")[0]
+    normal, wilson = row[2], row[5]
+    assert normal == f"{3 * 0.05 * 0.95**2 + 3 * 0.05**2 * 0.95:.3f}"
+    assert wilson == f"{0.95**3:.3f}"
 
 
 @pytest.mark.parametrize("name", RESULTS)

@@ -307,7 +307,11 @@ def summarize(evaluation: ClosedLoopEvaluation, episodes: Sequence[Row]) -> Row:
         "success_of_arm_can_ci95": wilson_interval(num_solved, len(solvable)) if solvable else None,
         "hidden": mean("hidden"),
         "found": mean("found"),
-        "found_ci95": mean_interval([e["found"] for e in completed]),
+        "found_ci95": mean_interval(
+            [e["found"] for e in completed],
+            0,
+            max((e["objects"] for e in completed), default=0),
+        ),
         "found_of_hidden": sum(e["found"] for e in completed)
         / max(1, sum(e["hidden"] for e in completed)),
         "moves_of_successes": float(np.mean([e["moves"] for e in successful]))

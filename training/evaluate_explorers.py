@@ -29,7 +29,7 @@ from drake_clutter.learning.pretrained import checkpoint_sha256
 from drake_clutter.records import read_jsonl
 from drake_clutter.reports.terminal_text import evaluation_table_rows
 from drake_clutter.scenes.scene_dataset import SceneDataset, load_scene_dataset
-from drake_clutter.statistics import bootstrap_ratio_interval
+from drake_clutter.statistics import ratio_interval
 from drake_clutter.tasks.episode import current_fidelity
 from drake_clutter.tasks.exploration_task import TerminationReason
 from drake_clutter.validation import to_plain
@@ -131,7 +131,9 @@ def to_result(record: Mapping[str, Any]) -> EpisodeResult:
 
 
 def summarize(
-    results: Sequence[EpisodeResult], baselines: Mapping[str, Sequence[EpisodeResult]]
+    results: Sequence[EpisodeResult],
+    baselines: Mapping[str, Sequence[EpisodeResult]],
+    max_objects: int,
 ) -> Row:
     """Return the metrics of an explorer.
 
@@ -139,8 +141,10 @@ def summarize(
         results: Results of the explorer, by scene.
         baselines: Results of the baselines on the first of these scenes, by name. The explorer's
             number of moves is divided by a baseline's, over the scenes in which both succeed.
+        max_objects: Largest number of objects of a scene.
     """
-    row = summarize_episodes(results, MOVE_LIMITS)
+    row = summarize_episodes(results, MOVE_LIMITS, max_objects)
+    max_moves = max(MOVE_LIMITS)
     for name, baseline in baselines.items():
         moves = [
             (ours.moves, theirs.moves)
@@ -148,9 +152,10 @@ def summarize(
             if {ours.ended, theirs.ended} == {TerminationReason.ALL_FOUND.value}
         ]
         ratio = sum(m for m, _ in moves) / sum(m for _, m in moves) if moves else None
-        interval = bootstrap_ratio_interval(*zip(*moves, strict=True)) if moves else None
         row[f"moves_to_{name}"] = ratio
-        row[f"moves_to_{name}_ci95"] = interval
+        row[f"moves_to_{name}_ci95"] = ratio_interval(
+            [m for m, _ in moves], [m for _, m in moves], (1, max_moves), (max_moves, 1)
+        )
         row[f"both_with_{name}"] = len(moves)
     return row
 
@@ -198,6 +203,7 @@ def evaluate_set(
         name: [results[k] for k in solvable if k < len(results)]
         for name, results in baselines.items()
     }
+    max_objects = max(len(scene.settled_poses or ()) for scene in scenes.scenes)
     rows = []
     for agent in agents:
         results = [to_result(record) for record in records[agent]]
@@ -208,9 +214,11 @@ def evaluate_set(
                 "sha256": scenes.sha256,
                 "agent": agent,
                 "weights": checkpoint_sha256(agent, PRETRAINED_EXPLORERS),
-                **summarize(results, baselines),
+                **summarize(results, baselines, max_objects),
                 "commits": list(dict.fromkeys(record["commit"] for record in records[agent])),
-                "solvable": summarize(solvable_results, solvable_baselines) if solvable else None,
+                "solvable": summarize(solvable_results, solvable_baselines, max_objects)
+                if solvable
+                else None,
             }
         )
     return rows

@@ -19,6 +19,7 @@ import results_closed_loop
 import results_exploration
 import results_generation
 import results_index
+import results_intervals
 import results_judge_agreement
 import results_negative
 import results_perception
@@ -36,6 +37,7 @@ PAGES: Mapping[str, Callable[[], str]] = {
     "results/perception.md": results_perception.page,
     "results/judge_agreement.md": results_judge_agreement.page,
     "results/calibration.md": results_calibration.page,
+    "results/intervals.md": results_intervals.page,
     "results/negative_results.md": results_negative.page,
     **{
         f"reference/api/{name}.md": partial(api_page.package_page, name)

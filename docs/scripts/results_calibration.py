@@ -36,7 +36,8 @@ def _scenes() -> str:
     text = section(
         "Random scenes and the paper's",
         "RG scenes judged by Drake; *hidden* is the mean number of hidden objects in a stable "
-        "scene. *Paper*: Table I of Kumar et al. 2022. Intervals are 95 %.",
+        "scene. *Paper*: Table I of Kumar et al. 2022. "
+        "[Intervals](intervals.md) are 95 %, of *hidden* by the normal approximation.",
         command="python benchmarks/random_generator_calibration.py --count 1000 --workers 2 --out "
         "FILE",
         seed=results["seed"],

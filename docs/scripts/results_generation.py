@@ -91,7 +91,8 @@ def _scenes() -> str:
         "*Stable* is a fraction of the laid-out scenes; *hidden* (objects per scene) and "
         "*solvable* (by the oracle search) are of the stable scenes. *(Paper)*: Table I of "
         "Kumar et al. 2022. *SG\\*, paper reward*: trained with the paper's reward, sampled at "
-        "temperature 0.25; the other SG\\* at 0.28. Intervals are 95 %.",
+        "temperature 0.25; the other SG\\* at 0.28. "
+        "[Intervals](intervals.md) are 95 %, of *hidden* by the normal approximation.",
         command="python training/evaluate_generators.py runs/table1",
         seed=1000,
         results=["training/results/table1.json"],

@@ -15,6 +15,7 @@ PAGES = (
     ("perception.md", "Perception", "Recall and accuracy of the trained detectors"),
     ("judge_agreement.md", "Judge agreement", "Static stability judge compared with Drake; speed"),
     ("calibration.md", "Calibration", "Random scenes compared with the paper's"),
+    ("intervals.md", "Confidence intervals", "Methods, and their coverage for few values"),
     ("negative_results.md", "Negative results", "What did not help"),
 )
 """File, title and content of the other pages of results."""
@@ -84,7 +85,7 @@ def page() -> str:
     return (
         "# Results\n\nEvery number on these pages is read from a results file in "
         "`training/results/` or `benchmarks/results/`, which names command, seed and "
-        "configuration. Intervals are 95 %: Wilson for rates, normal approximation for means.\n\n"
+        "configuration. [Intervals](intervals.md) are 95 %.\n\n"
         + table(
             ["page", "content"],
             [[f"[{title}]({file})", content] for file, title, content in PAGES],

@@ -16,7 +16,7 @@ from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.seeding import item_rng
-from drake_clutter.statistics import bootstrap_ratio_interval, mean_interval, wilson_interval
+from drake_clutter.statistics import mean_interval, ratio_interval, wilson_interval
 from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration_task import TerminationReason
 
@@ -129,17 +129,19 @@ class EpisodeRunner:
 
 
 def summarize_episodes(
-    results: Sequence[EpisodeResult], move_limits: Sequence[int]
+    results: Sequence[EpisodeResult], move_limits: Sequence[int], max_objects: int
 ) -> dict[str, Any]:
     """Return the statistics of an agent's episodes.
 
     For each limit, `within_LIMIT` holds the success rate, the number and the fraction of hidden
     objects found, and the collapse rate, as if the episodes had ended after that number of moves.
-    Keys that end in `ci95` hold 95 % confidence intervals.
+    Keys that end in `ci95` hold 95 % confidence intervals: those of Wilson for rates, those of
+    Gaffke for means and ratios (`drake_clutter.statistics`).
 
     Args:
         results: Results of one agent on scenes with hidden objects.
-        move_limits: Numbers of moves, none above the episodes' maximum.
+        move_limits: Numbers of moves; the largest is the episodes' maximum.
+        max_objects: Largest number of objects of a scene, which bounds the number found.
     """
     num_hidden = [r.hidden for r in results]
     row: dict[str, Any] = {
@@ -158,15 +160,18 @@ def summarize_episodes(
             "success": num_successes / len(results),
             "success_ci95": wilson_interval(num_successes, len(results)),
             "found": float(np.mean(num_found)),
-            "found_ci95": mean_interval(num_found),
+            "found_ci95": mean_interval(num_found, 0, max_objects),
             "found_of_hidden": sum(num_found) / sum(num_hidden),
-            "found_of_hidden_ci95": bootstrap_ratio_interval(num_found, num_hidden),
+            # All objects may be hidden in a scene, and none or all of them found.
+            "found_of_hidden_ci95": ratio_interval(
+                num_found, num_hidden, (0, max_objects), (max_objects, max_objects)
+            ),
             "collapsed": num_collapsed / len(results),
             "collapsed_ci95": wilson_interval(num_collapsed, len(results)),
         }
     success_moves = [r.moves for r in results if r.ended == TerminationReason.ALL_FOUND.value]
     num_moves = sum(r.moves for r in results)
     row["moves_of_successes"] = float(np.mean(success_moves)) if success_moves else None
-    row["moves_of_successes_ci95"] = mean_interval(success_moves)
+    row["moves_of_successes_ci95"] = mean_interval(success_moves, 1, max(move_limits))
     row["not_carried_out"] = sum(r.not_carried_out for r in results) / max(1, num_moves)
     return row

@@ -287,7 +287,8 @@ def summarize_scenes(
     others over all scenes. `largest_stack_share` is the mean fraction of a scene's objects that are
     in its largest stack; `balanced_share` is the fraction of scenes in which that is at most
     `MAX_BALANCED_STACK_FRACTION`; `class_entropy` is the entropy of the classes of all objects
-    [bit]. Keys that end in `ci95` hold 95 % confidence intervals.
+    [bit]. Keys that end in `ci95` hold 95 % confidence intervals: those of Wilson for rates, that
+    of Gaffke for the mean (`drake_clutter.statistics`).
 
     Args:
         job: The batch.
@@ -326,7 +327,7 @@ def summarize_scenes(
         "stability_rate": num_stable / count,
         "stability_ci95": wilson_interval(num_stable, count),
         "hidden_mean": float(np.mean(num_hidden)) if num_hidden else None,
-        "hidden_ci95": mean_interval(num_hidden),
+        "hidden_ci95": mean_interval(num_hidden, 0, job.nodes - 2),  # tray, end
         "solvable_share": num_solvable / num_stable if has_solvable else None,
         "solvable_ci95": wilson_interval(num_solvable, num_stable) if has_solvable else None,
         "distinct_share": len(canonical_forms) / count,

@@ -41,12 +41,14 @@ class EvaluationScene:
         index: Index of the scene in its set; None for a scene file.
         classes: Names of the classes that its objects may have.
         cell: Work cell that the scene was made with.
+        num_objects: Number of its objects; 0 if the set has no settled poses.
     """
 
     file: Path
     index: int | None
     classes: frozenset[str]
     cell: WorkCell
+    num_objects: int
 
 
 def load_evaluation_scenes(source: str, catalog_folder: Path | None) -> list[EvaluationScene]:
@@ -75,8 +77,8 @@ def load_evaluation_scenes(source: str, catalog_folder: Path | None) -> list[Eva
         dataset = load_scene_dataset(scenes, catalog)
         classes = frozenset(c.name for c in dataset.classes)
         return [
-            EvaluationScene(scenes, number, classes, dataset.cell)
-            for number in range(len(dataset.scenes))
+            EvaluationScene(scenes, number, classes, dataset.cell, len(scene.settled_poses or ()))
+            for number, scene in enumerate(dataset.scenes)
         ]
     paths = sorted(scenes.glob("*.yaml"))
     if not paths:
@@ -89,7 +91,9 @@ def load_evaluation_scenes(source: str, catalog_folder: Path | None) -> list[Eva
         file = load_scene(path, catalog)
         if file.verdict is not None and file.verdict.hidden:
             names = frozenset(o.object_class.name for o in file.scene.objects)
-            evaluation_scenes.append(EvaluationScene(path, None, names, file.cell))
+            evaluation_scenes.append(
+                EvaluationScene(path, None, names, file.cell, len(file.scene.objects))
+            )
     if not evaluation_scenes:
         raise InputError(
             f"{scenes}: none of {len(paths)} scenes is stable and has hidden objects; expected "
@@ -171,10 +175,13 @@ def evaluate_explorers(
             f"--scenes: none of {len(scenes)} scenes has objects that are hidden from the "
             "configured camera; expected scenes with hidden objects"
         )
+    max_objects = max(scene.num_objects for scene in scenes)
     rows = [
         {"agent": agent}
         | summarize_episodes(
-            [result for result in results if result.agent == agent], move_limits(max_moves)
+            [result for result in results if result.agent == agent],
+            move_limits(max_moves),
+            max_objects,
         )
         for agent in agents
     ]
