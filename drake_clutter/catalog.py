@@ -38,6 +38,8 @@ _NAME = re.compile(r"[a-z][a-z0-9_]*")
 _EMPTY_MAPPING: Any = Field(default_factory=dict)
 _Size = Annotated[float, InRange(3, 1000)]
 """An extent of an object [mm]."""
+_Coordinate = Annotated[float, InRange(-500, 500)]
+"""A coordinate of a point in an object [mm]."""
 _RESERVED_NAMES = frozenset({"tray", "object_slot", "open_slot", "end", "dummy"})
 """Names of the support and of nodes of the scene grammar."""
 
@@ -100,6 +102,8 @@ class ClassEntry(StrictModel):
         size_mm: Extents [mm]; diameter, diameter, height of a cylinder. A mesh's are measured and
             must be left out. Shape (3,).
         mass_g: Mass [g].
+        center_of_mass_mm: Center of mass in O [mm], as of a bottle that is half full; None for that
+            of uniform density. Shape (3,).
         source: Source of size and mass.
         pairs: Arrangements in which two objects of the class stand as a pair.
         only_rest: Only orientation at rest (cans stand, a marker lies); None if it varies.
@@ -111,6 +115,7 @@ class ClassEntry(StrictModel):
     shape: Shape
     size_mm: tuple[_Size, _Size, _Size] | None = None
     mass_g: Annotated[float, InRange(1e-6, 20_000)]
+    center_of_mass_mm: tuple[_Coordinate, _Coordinate, _Coordinate] | None = None
     source: str = ""
     pairs: tuple[PairArrangement, ...] = ()
     only_rest: RestOrientation | None = None
@@ -167,6 +172,8 @@ class ObjectClass:
         size: Extents of the bounding box in O [m]; (diameter, diameter, height) of a cylinder.
             Shape (3,).
         mass: Mass [kg].
+        stated_center_of_mass: Center of mass in O that the catalog states [m]; None for that of
+            uniform density. Shape (3,).
         source: Source of size and mass.
         pairs: Pair arrangements for which the grammar has a rule.
         only_rest: Only orientation at rest; None if it varies.
@@ -179,6 +186,7 @@ class ObjectClass:
     shape: Shape
     size: tuple[float, float, float]
     mass: float
+    stated_center_of_mass: tuple[float, float, float] | None
     source: str
     pairs: tuple[PairArrangement, ...]
     only_rest: RestOrientation | None
@@ -199,24 +207,53 @@ class ObjectClass:
 
     @cached_property
     def verified_sdf_path(self) -> Path:
-        """Path of the built SDF model, after a check of its mass against the catalog.
+        """Path of the built SDF model, after a check of its inertial against the catalog.
 
         Raises:
-            InputError: The model is missing or damaged, or was built with another mass.
+            InputError: The model is missing or damaged, or was built with another mass or center
+                of mass.
         """
+        self._read_center_of_mass()
+        return self.sdf_path
+
+    @cached_property
+    def center_of_mass(self) -> NDArray[np.float64]:
+        """Center of mass p_OCm [m]; of a mesh without a stated one, that of its built model.
+
+        Shape (3,).
+
+        Raises:
+            InputError: The model of a mesh cannot be used, see `verified_sdf_path`.
+        """
+        if self.stated_center_of_mass is not None:
+            return np.array(self.stated_center_of_mass)
+        return self._read_center_of_mass() if self.shape is Shape.MESH else np.zeros(3)
+
+    def _read_center_of_mass(self) -> NDArray[np.float64]:
+        """Return the center of mass of the built model, after a check against the catalog."""
         remedy = f"run `drake-clutter assets build {self.folder.parent}`"
         if not self.sdf_path.is_file():
             raise InputError(f"{self.folder}: class {self.name} has no assets; {remedy}")
         try:
-            text = ElementTree.parse(self.sdf_path).findtext("model/link/inertial/mass", "nan")
-            mass = float(text)
+            model = ElementTree.parse(self.sdf_path)
+            mass = float(model.findtext("model/link/inertial/mass", "nan"))
+            pose = model.findtext("model/link/inertial/pose", "").split()
+            x, y, z = (float(value) for value in pose[:3])
         except (ElementTree.ParseError, ValueError) as error:
             raise InputError(f"{self.sdf_path}: cannot be read ({error}); {remedy}") from error
         if not math.isclose(mass, self.mass, rel_tol=1e-5):
             raise InputError(
                 f"{self.sdf_path}: mass: {mass}; expected the catalog's, {self.mass:g} kg; {remedy}"
             )
-        return self.sdf_path
+        expected = self.stated_center_of_mass or (
+            (x, y, z) if self.shape is Shape.MESH else (0.0, 0.0, 0.0)
+        )
+        if not np.allclose((x, y, z), expected, rtol=0, atol=1e-6):
+            raise InputError(
+                f"{self.sdf_path}: center of mass: {x:g} {y:g} {z:g}; expected the catalog's, "
+                f"{' '.join(f'{value:g}' for value in expected)} m; {remedy}"
+            )
+        return np.array([x, y, z])
 
     @cached_property
     def convex_pieces(self) -> tuple[NDArray[np.float64], ...]:
@@ -305,11 +342,22 @@ def _make_object_class(name: str, entry: ClassEntry, folder: Path, where: str) -
         assert entry.size_mm is not None
         x, y, z = (s / 1000 for s in entry.size_mm)
         size = (x, y, z)
+    center_of_mass = None
+    if entry.center_of_mass_mm is not None:
+        center_x, center_y, center_z = (value / 1000 for value in entry.center_of_mass_mm)
+        center_of_mass = (center_x, center_y, center_z)
+        if (np.abs(center_of_mass) >= np.asarray(size) / 2).any():
+            limits = " x ".join(f"{500 * extent:g}" for extent in size)
+            raise InputError(
+                f"{where}.center_of_mass_mm: {format_value(list(entry.center_of_mass_mm))}; "
+                f"expected a point within {limits} mm of the center of the bounding box"
+            )
     return ObjectClass(
         name,
         entry.shape,
         size,
         entry.mass_g / 1000,
+        center_of_mass,
         entry.source,
         entry.pairs,
         entry.only_rest,

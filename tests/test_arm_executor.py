@@ -11,6 +11,8 @@ import pytest
 from conftest import DEFAULT_CELL, cell_with, executed, resting, rng, scene_of
 from pydrake.systems.analysis import Simulator
 
+from drake_clutter.assets import build_assets
+from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
@@ -25,7 +27,7 @@ from drake_clutter.reports.filmstrip import (
 )
 from drake_clutter.reports.recording import write_recording
 from drake_clutter.scenes.interfaces import Move, MoveResult
-from drake_clutter.scenes.scene import Pose, Scene
+from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.station.arm_executor import ArmExecutor, evaluate_outcome
 from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.command_schedule import DWELL_TIME, build_command_schedule
@@ -307,3 +309,29 @@ def test_an_object_placed_on_an_edge_falls() -> None:
     result = StationSimulation(DEFAULT_CELL, scene).execute(plan)
     assert result.grasped
     assert result.poses["gelatin_box"].translation[2] < 0.1
+
+
+def test_a_thin_sheet_is_lifted_from_the_tray_and_from_a_box(tmp_path: Path) -> None:
+    """The floor is 4 mm below the lip, less than the distance kept from other bodies."""
+    sheet_entry = "{shape: box, size_mm: [150, 200, 4], mass_g: 250}"
+    (tmp_path / "catalog.yaml").write_text(f"classes:\n  sheet: {sheet_entry}\n")
+    build_assets(tmp_path)
+    sheet_class = load_catalog(tmp_path).classes["sheet"]
+    box = resting("pudding_box", xy=(0.15, 0.0))
+    planner = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(optimize=False))
+    on_tray = Pose((-0.1, 0.0, 0.002), (1.0, 0.0, 0.0, 0.0))
+    on_box = Pose((0.15, 0.0, 0.037), (1.0, 0.0, 0.0, 0.0))
+    from_tray, from_box = (
+        (planner.plan([sheet, box], "sheet", X_TO_place.translated((0.0, 0.0, 0.001))), sheet)
+        for sheet, X_TO_place in (
+            (SceneObject("sheet", sheet_class, on_tray), on_box),
+            (SceneObject("sheet", sheet_class, on_box), on_tray),
+        )
+    )
+    assert isinstance(from_box[0], PickPlacePlan)
+    plan, sheet = from_tray
+    assert isinstance(plan, PickPlacePlan)
+    result = StationSimulation(DEFAULT_CELL, scene_of(sheet, box)).execute(plan)
+    assert not result.lost_object, str(result)
+    assert result.position_error < 0.001
+    assert result.poses["sheet"].p[2] == pytest.approx(0.037, abs=0.0003)

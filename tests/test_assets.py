@@ -18,6 +18,7 @@ from pydrake.geometry import ProximityProperties, Role
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
+from scipy.spatial import ConvexHull
 
 from drake_clutter.assets import MOTIFS, build_assets, build_class
 from drake_clutter.assets.contact_properties import HYDROELASTIC_MODULUS, SURFACE_FRICTION
@@ -46,13 +47,13 @@ def plant_of(model: str, package: Path) -> tuple[MultibodyPlant, list[ProximityP
     ]
 
 
-def check_contact(properties: ProximityProperties, *, rigid: bool) -> None:
+def check_contact(properties: ProximityProperties, modulus: float | None) -> None:
     """Assert the contact properties; only a compliant geometry has a modulus."""
     assert properties.HasProperty("hydroelastic", "compliance_type")
-    assert properties.HasProperty("hydroelastic", "hydroelastic_modulus") is not rigid
-    if not rigid:
-        assert (
-            properties.GetProperty("hydroelastic", "hydroelastic_modulus") == HYDROELASTIC_MODULUS
+    assert properties.HasProperty("hydroelastic", "hydroelastic_modulus") == (modulus is not None)
+    if modulus is not None:
+        assert properties.GetProperty("hydroelastic", "hydroelastic_modulus") == pytest.approx(
+            modulus, rel=1e-3
         )
     friction = properties.GetProperty("material", "coulomb_friction")
     assert friction.static_friction() == friction.dynamic_friction() == SURFACE_FRICTION
@@ -96,7 +97,7 @@ def test_shipped_model(entry: ObjectClass) -> None:
         entry.mass * np.diag(moments), rel=1e-9, abs=1e-18
     )
     (contact,) = contacts
-    check_contact(contact, rigid=False)
+    check_contact(contact, HYDROELASTIC_MODULUS)
     if entry.shape is Shape.CYLINDER:
         # Drake puts ceil(circumference / hint) edges around, at any size.
         edges = math.ceil(math.pi * x / contact.GetProperty("hydroelastic", "resolution_hint"))
@@ -209,9 +210,22 @@ def test_example_loads_in_drake(built_example: Path) -> None:
     assert inertia.IsPhysicallyValid()
     assert -0.02 < inertia.get_com()[0] < -0.005  # away from the handle
     assert inertia.get_com()[2] < 0  # towards the base
-    assert len(contacts) == len(list((built_example / "mug").glob("convex_*.obj")))
-    for contact in contacts:
-        check_contact(contact, rigid=False)
+    mug = load_catalog(built_example).classes["mug"]
+    assert len(contacts) == len(mug.convex_pieces)
+    _, middle, largest = sorted(mug.size)
+    for contact, corners in zip(contacts, mug.convex_pieces, strict=True):
+        center = trimesh.convex.convex_hull(corners).center_mass
+        faces = ConvexHull(corners).equations
+        depth = -(faces[:, :3] @ center + faces[:, 3]).max()
+        check_contact(contact, 5e8 * 0.330 * depth / (middle * largest))
+
+
+def test_a_sheet_is_as_stiff_on_its_face_as_a_box(tmp_path: Path) -> None:
+    """Its squared frequency, modulus * area / (depth * mass), is 5e8 rad^2/s^2."""
+    user_class(tmp_path, "{shape: box, size_mm: [4, 150, 200], mass_g: 250}")
+    build_assets(tmp_path)
+    _, (contact,) = plant_of(f"package://{tmp_path.name}/block/model.sdf", tmp_path / "package.xml")
+    check_contact(contact, 5e8 * 0.250 * 0.002 / (0.15 * 0.20))
 
 
 def test_convex_mesh_is_one_piece_with_the_inertia_of_its_box(tmp_path: Path) -> None:
@@ -279,7 +293,7 @@ def test_the_tray(tmp_path: Path) -> None:
     plant, contacts = plant_of("package://it/tray.sdf", tmp_path / "package.xml")
     assert len(contacts) == 5
     for contact in contacts:
-        check_contact(contact, rigid=True)
+        check_contact(contact, None)
     assert plant.num_bodies() == 2
 
 

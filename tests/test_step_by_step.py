@@ -191,7 +191,17 @@ def test_what_can_be_held_by_another_load_is_not_fixed() -> None:
 def block(name: str, shape: Shape, size: tuple[float, float, float], mass: float) -> ObjectClass:
     """Return a class without assets, which the static judge does not need."""
     return ObjectClass(
-        name, shape, size, mass, "", (), None, None, CLASSES["sugar_box"].label, Path("nowhere")
+        name,
+        shape,
+        size,
+        mass,
+        None,
+        "",
+        (),
+        None,
+        None,
+        CLASSES["sugar_box"].label,
+        Path("nowhere"),
     )
 
 

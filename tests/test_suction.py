@@ -4,6 +4,7 @@
 # mypy: allow-untyped-calls
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ from drake_clutter.simulation.scene_plant import rigid_transform
 
 CUP = SuctionGripper()
 ALONG_MINUS_X = RotationMatrix(np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]))
-SAMPLING = GraspSampling(spacing=0.012, max_grasps=9, min_payload_acceleration=0.3)
+SAMPLING = GraspSampling(spacing=0.012, lip_gap=0.0005, max_grasps=9, min_payload_acceleration=0.3)
 
 
 def on_top(height: float, x: float = 0.0, tilt: float = 0.0) -> RigidTransform:
@@ -215,6 +216,18 @@ def test_convex_pieces_that_bulge_over_a_flat_lid_do_not_break_the_seal(tmp_path
     grasps = CUP.sample_grasps(own, RigidTransform([0.0, 0.0, 0.03]), SAMPLING)
     assert not isinstance(grasps, GraspFailure)
     assert grasps[0].p_TG == pytest.approx([0.0, 0.0, 0.06], abs=1e-6)  # where the cup touches
+    # The lid is 3 mm below the piece: a gap of 1.9 mm more seals, one of 2.1 mm does not.
+    for lip_gap, value in ((0.0019, None), (0.0021, 0.0051)):
+        found = CUP.sample_grasps(
+            own, RigidTransform([0.0, 0.0, 0.03]), replace(SAMPLING, lip_gap=lip_gap)
+        )
+        assert CUP.can_attach(own, on_top(0.03 + lip_gap)) is (value is None)
+        if value is not None:
+            assert isinstance(found, GraspFailure)
+            assert found.reason is GraspFailureReason.NO_SEAL
+            assert found.value == pytest.approx(value, abs=1e-6)
+        else:
+            assert not isinstance(found, GraspFailure)
 
 
 def test_every_grasp_on_a_mesh_is_one_that_the_simulation_attaches(tmp_path: Path) -> None:
@@ -225,7 +238,8 @@ def test_every_grasp_on_a_mesh_is_one_that_the_simulation_attaches(tmp_path: Pat
     grasps = CUP.sample_grasps(own, X_TO, SAMPLING)
     assert not isinstance(grasps, GraspFailure)
     for grasp in grasps:
-        X_TG = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), grasp.p_TG)
+        p_TG = grasp.p_TG + np.array([0.0, 0.0, SAMPLING.lip_gap])
+        X_TG = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), p_TG)
         X_OG = X_TO.InvertAndCompose(X_TG)
         assert CUP.can_attach(own, X_OG)
         assert lip_surface_profile(own, X_OG, CUP.cup_diameter).min() <= MAX_SEAL_GAP

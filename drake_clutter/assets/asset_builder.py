@@ -16,7 +16,10 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from drake_clutter.assets.contact_properties import proximity_properties_sdf
+from drake_clutter.assets.contact_properties import (
+    hydroelastic_modulus,
+    proximity_properties_sdf,
+)
 from drake_clutter.assets.convex_pieces import decompose_convex, measure_deviation, obj_text
 from drake_clutter.assets.mesh_appearance import has_appearance, textured_parts
 from drake_clutter.assets.textured_mesh import box_mesh, cylinder_mesh, gltf_text, map_strip_texture
@@ -115,13 +118,18 @@ class _Inertial:
 
 
 def _compute_inertial(object_class: ObjectClass, mesh: trimesh.Trimesh | None) -> _Inertial:
-    """Return the mass distribution of a solid of uniform density."""
+    """Return the mass distribution of a solid of uniform density.
+
+    A center of mass that the catalog states replaces that of the solid; the inertia about it is
+    assumed to be the same.
+    """
     mass = object_class.mass
     x, y, z = object_class.size
+    stated = object_class.stated_center_of_mass
     if mesh is not None:
         density = mass / mesh.volume
         return _Inertial(
-            np.asarray(mesh.center_mass, float),
+            np.asarray(mesh.center_mass if stated is None else stated, float),
             np.asarray(mesh.moment_inertia, float) * density / mesh.density,
         )
     if object_class.shape is Shape.BOX:
@@ -130,44 +138,52 @@ def _compute_inertial(object_class: ObjectClass, mesh: trimesh.Trimesh | None) -
         radius = x / 2
         across = mass / 12 * (3 * radius**2 + z**2)
         moments = np.array([across, across, mass / 2 * radius**2])
-    return _Inertial(np.zeros(3), np.diag(moments))
+    return _Inertial(np.array(stated or (0.0, 0.0, 0.0)), np.diag(moments))
 
 
-def _collision_sdf(name: str, geometry: str, hint: float) -> str:
+def _collision_sdf(name: str, geometry: str, hint: float, modulus: float) -> str:
     """Return the SDF element of one collision geometry."""
     return f"""      <collision name="{name}">
         <geometry>
           {geometry}
         </geometry>
-{proximity_properties_sdf(hint, compliant=True)}
+{proximity_properties_sdf(hint, modulus)}
       </collision>
 """
 
 
-def _collisions_sdf(object_class: ObjectClass, num_pieces: int) -> str:
+def _center_depth(piece: trimesh.Trimesh) -> float:
+    """Return the distance from the centroid of a convex piece to its nearest face [m]."""
+    arms = np.asarray(piece.triangles[:, 0] - piece.center_mass)
+    return float((arms * np.asarray(piece.face_normals)).sum(axis=1).min())
+
+
+def _collisions_sdf(object_class: ObjectClass, pieces: Sequence[trimesh.Trimesh]) -> str:
     """Return the SDF elements of a class's collision geometry."""
     x, y, z = object_class.size
+    smallest, middle, largest = sorted(object_class.size)
     if object_class.shape is Shape.BOX:
-        return _collision_sdf("box", f"<box><size>{x!r} {y!r} {z!r}</size></box>", max(x, y, z))
+        modulus = hydroelastic_modulus(object_class.mass, middle * largest, smallest / 2)
+        geometry = f"<box><size>{x!r} {y!r} {z!r}</size></box>"
+        return _collision_sdf("box", geometry, largest, modulus)
     if object_class.shape is Shape.CYLINDER:
         radius = x / 2
+        modulus = hydroelastic_modulus(object_class.mass, math.pi * radius**2, smallest / 2)
         geometry = f"<cylinder><radius>{radius!r}</radius><length>{z!r}</length></cylinder>"
-        return _collision_sdf(
-            "cylinder",
-            geometry,
-            radius
-            * (
-                _STANDING_MESH_RESOLUTION
-                if object_class.only_rest is RestOrientation.UPRIGHT
-                else _LYING_MESH_RESOLUTION
-            ),
+        resolution = (
+            _STANDING_MESH_RESOLUTION
+            if object_class.only_rest is RestOrientation.UPRIGHT
+            else _LYING_MESH_RESOLUTION
         )
-    names = [f"convex_{index:03d}" for index in range(num_pieces)]
+        return _collision_sdf("cylinder", geometry, radius * resolution, modulus)
     return "".join(
         _collision_sdf(
-            name, f"<mesh><uri>{name}.obj</uri><drake:declare_convex/></mesh>", max(x, y, z)
+            f"convex_{index:03d}",
+            f"<mesh><uri>convex_{index:03d}.obj</uri><drake:declare_convex/></mesh>",
+            largest,
+            hydroelastic_modulus(object_class.mass, middle * largest, _center_depth(piece)),
         )
-        for name in names
+        for index, piece in enumerate(pieces)
     )
 
 
@@ -243,7 +259,7 @@ def _make_asset_files(object_class: ObjectClass, object_mesh: ObjectMesh | None)
         source=_comment_text(object_class.source or "not stated"),
         com=" ".join(repr(float(value)) for value in inertial.com),
         mass=object_class.mass,
-        collisions=_collisions_sdf(object_class, len(pieces)),
+        collisions=_collisions_sdf(object_class, pieces),
         **{
             f"i{'xyz'[i]}{'xyz'[j]}": float(inertial.inertia[i, j])
             for i in range(3)

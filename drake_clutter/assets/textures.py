@@ -82,10 +82,11 @@ class _Panel:
     def draw_rectangle(
         self, left: float, top: float, right: float, bottom: float, fill: str
     ) -> None:
-        """Draw a rectangle; the sides are fractions of the panel's width and height."""
+        """Draw a rectangle of at least a pixel; the sides are fractions of width and height."""
         w, h = self.size
         ImageDraw.Draw(self.image).rectangle(
-            (left * w, top * h, right * w - 1, bottom * h - 1), fill=fill
+            (left * w, top * h, max(right * w - 1, left * w), max(bottom * h - 1, top * h)),
+            fill=fill,
         )
 
     def draw_motif(

@@ -65,8 +65,8 @@ class GraspFailure:
 
     Attributes:
         reason: Failure of the sampled grasp that came closest to being feasible.
-        value: Flatness deviation under the best grasp [m] if no grasp seals, or mass of the object
-            [kg] if it is too heavy.
+        value: Flatness deviation or gap under the best grasp [m] if no grasp seals, or mass of the
+            object [kg] if it is too heavy.
     """
 
     reason: GraspFailureReason
@@ -79,11 +79,13 @@ class GraspSampling:
 
     Attributes:
         spacing: Distance of neighboring grasp points [m].
+        lip_gap: Gap between gripper and object when the gripper is switched on [m].
         max_grasps: Largest number of grasps.
         min_payload_acceleration: A grasp must hold the object at this acceleration [m/s^2].
     """
 
     spacing: float
+    lip_gap: float
     max_grasps: int
     min_payload_acceleration: float
 
@@ -120,7 +122,9 @@ class Gripper(Protocol):
         X_TO: RigidTransform,
         sampling: GraspSampling,
     ) -> tuple[Grasp, ...] | GraspFailure:
-        """Return feasible grasps of an object from above, the closest to its center first.
+        """Return feasible grasps from above, the closest to the center of mass first.
+
+        `can_attach` holds at each of them, raised by `GraspSampling.lip_gap`.
 
         Args:
             object_class: Class of the object.

@@ -130,25 +130,28 @@ class SuctionGripper(StrictModel):
         corners_T = corners_T + X_TO.translation()
         lower, upper = corners_T.min(axis=0), corners_T.max(axis=0)
         grasps = list[Grasp]()
-        min_deviation = math.inf
-        for x, y in _grid_points(lower[:2], upper[:2], sampling.spacing):
+        p_TCm = X_TO @ object_class.center_of_mass
+        # Of the profiles that do not seal: whether they are uneven, and deviation or gap.
+        closest_mismatch = (True, math.inf)
+        has_seal = False
+        for x, y in _grid_points(lower[:2], upper[:2], p_TCm[:2], sampling.spacing):
             X_TG = RigidTransform(_DOWNWARD_ROTATION, [x, y, upper[2]])
-            deviation = lip_flatness_deviation(
-                object_class, X_TO.InvertAndCompose(X_TG), self.cup_diameter
-            )
-            min_deviation = min(min_deviation, deviation)
-            if deviation > self.unevenness:
-                continue
-            if object_class.shape is Shape.MESH:
+            X_OG = X_TO.InvertAndCompose(X_TG)
+            profile = lip_surface_profile(object_class, X_OG, self.cup_diameter)
+            if object_class.shape is Shape.MESH and np.isfinite(profile).all():
                 # The lip goes down until it touches a convex piece, which may bulge.
-                X_OG = X_TO.InvertAndCompose(X_TG)
                 contact_depth = _contact_depth(object_class, X_OG, self.cup_diameter)
-                gap = lip_surface_profile(object_class, X_OG, self.cup_diameter).min()
-                if gap - contact_depth > MAX_SEAL_GAP:
-                    min_deviation = max(min_deviation, gap - contact_depth)
-                    continue
                 X_TG = RigidTransform(_DOWNWARD_ROTATION, [x, y, upper[2] - contact_depth])
-            p_GCm = X_TG.rotation().inverse() @ (X_TO.translation() - X_TG.translation())
+                profile = profile - contact_depth
+            profile = profile + sampling.lip_gap
+            if not self._seals(profile):
+                deviation = _deviation(profile)
+                is_uneven = deviation > self.unevenness
+                value = deviation if is_uneven else float(profile.min())
+                closest_mismatch = min(closest_mismatch, (is_uneven, value))
+                continue
+            has_seal = True
+            p_GCm = X_TG.rotation().inverse() @ (p_TCm - X_TG.translation())
             acceleration = self.max_acceleration(object_class.mass, p_GCm)
             if acceleration >= sampling.min_payload_acceleration:
                 # The horizontal offset of the load depends on the yaw, and is neglected.
@@ -159,13 +162,17 @@ class SuctionGripper(StrictModel):
                     break
         if grasps:
             return tuple(grasps)
-        if min_deviation > self.unevenness:
-            return GraspFailure(GraspFailureReason.NO_SEAL, min_deviation)
+        if not has_seal:
+            return GraspFailure(GraspFailureReason.NO_SEAL, closest_mismatch[1])
         return GraspFailure(GraspFailureReason.TOO_HEAVY, object_class.mass)
 
     def can_attach(self, object_class: ObjectClass, X_OG: RigidTransform) -> bool:
         """Return whether the lip seals on the surface at a pose, see `Gripper`."""
-        return lip_flatness_deviation(object_class, X_OG, self.cup_diameter) <= self.unevenness
+        return self._seals(lip_surface_profile(object_class, X_OG, self.cup_diameter))
+
+    def _seals(self, profile: Floats) -> bool:
+        """Return whether the lip seals at distances to the surface, see `lip_surface_profile`."""
+        return bool(_deviation(profile) <= self.unevenness and profile.min() <= MAX_SEAL_GAP)
 
     def max_acceleration(self, mass: float, p_GCm: Floats) -> float:
         """Return the largest acceleration of a cup that points down, see `Gripper`.
@@ -200,12 +207,13 @@ class SuctionGripper(StrictModel):
         return np.asarray(np.maximum(opening, tangential / (self.friction * normal_force)))
 
 
-def _grid_points(lower: Floats, upper: Floats, spacing: float) -> Floats:
-    """Return grid points of a rectangle, the closest to its center first.
+def _grid_points(lower: Floats, upper: Floats, target: Floats, spacing: float) -> Floats:
+    """Return grid points of a rectangle, the closest to a target first.
 
     Args:
         lower: Lower corner [m]. Shape (2,).
         upper: Upper corner [m]. Shape (2,).
+        target: Position of the target [m]. Shape (2,).
         spacing: Grid spacing [m].
 
     Returns:
@@ -215,7 +223,7 @@ def _grid_points(lower: Floats, upper: Floats, spacing: float) -> Floats:
     x, y = np.meshgrid(*(np.concatenate([-s[:0:-1], s]) for s in steps), indexing="ij")
     center = (lower + upper) / 2
     points = center + np.column_stack([x.ravel(), y.ravel()])
-    distances = np.round(np.linalg.norm(points - center, axis=1), 6)
+    distances = np.round(np.linalg.norm(points - target, axis=1), 6)
     return np.asarray(points[np.argsort(distances, kind="stable")])
 
 
@@ -318,8 +326,12 @@ def lip_flatness_deviation(
     Returns:
         Deviation [m]; infinite if a part of the lip has no surface below.
     """
-    depth = lip_surface_profile(object_class, X_OG, diameter)
-    return float(np.ptp(depth)) if np.isfinite(depth).all() else math.inf
+    return _deviation(lip_surface_profile(object_class, X_OG, diameter))
+
+
+def _deviation(profile: Floats) -> float:
+    """Return the deviation of a `lip_surface_profile` from a plane [m]; infinite over an edge."""
+    return float(np.ptp(profile)) if np.isfinite(profile).all() else math.inf
 
 
 def payload_wrench(mass: float, p_GCm: Floats, acceleration: Floats) -> tuple[Floats, Floats]:

@@ -6,6 +6,8 @@ Frame T, the link `tray`: origin at the center of the floor's upper surface, z u
 from drake_clutter.assets.contact_properties import proximity_properties_sdf
 from drake_clutter.cell.support import Support
 
+FLOOR = "floor"
+"""Name of the geometry of the floor."""
 _FLOOR_COLOR = "0.72 0.60 0.46 1"
 _WALL_COLOR = "0.55 0.42 0.30 1"
 _WALL_NAMES = {"+x": "rim_front", "-x": "rim_back", "+y": "rim_left", "-y": "rim_right"}
@@ -28,7 +30,7 @@ def _box(name: str, size: _Vector, p_TG: _Vector, color: str) -> str:
       </visual>
       <collision name="{name}">
         {box}
-{proximity_properties_sdf(1.0, compliant=False)}
+{proximity_properties_sdf(1.0, None)}
       </collision>"""
 
 
@@ -44,7 +46,7 @@ def support_boxes(support: Support) -> list[tuple[str, _Vector, _Vector]]:
         "+y": ((x, thickness, height), (0, (y + thickness) / 2, z)),
         "-y": ((x, thickness, height), (0, -(y + thickness) / 2, z)),
     }
-    floor = ("floor", (x, y, support.floor_thickness), (0.0, 0.0, -support.floor_thickness / 2))
+    floor = (FLOOR, (x, y, support.floor_thickness), (0.0, 0.0, -support.floor_thickness / 2))
     return [
         floor,
         *((_WALL_NAMES[side], *walls[side]) for side in _WALL_NAMES if side in support.walls),
@@ -54,7 +56,7 @@ def support_boxes(support: Support) -> list[tuple[str, _Vector, _Vector]]:
 def support_sdf(support: Support) -> str:
     """Return the SDF model of a support."""
     boxes = [
-        _box(name, size, p_TG, _FLOOR_COLOR if name == "floor" else _WALL_COLOR)
+        _box(name, size, p_TG, _FLOOR_COLOR if name == FLOOR else _WALL_COLOR)
         for name, size, p_TG in support_boxes(support)
     ]
     return f"""<?xml version="1.0"?>

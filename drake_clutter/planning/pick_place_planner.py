@@ -152,13 +152,16 @@ class PickPlacePlanner:
         return not objects_resting_on(scene_object, objects) and self.can_grasp(scene_object)
 
     def _find_grasps(self, picked: SceneObject) -> tuple[Grasp, ...] | PlanningFailure:
-        """Return the feasible grasps of an object, closest to the center of its top first."""
+        """Return the feasible grasps of an object, closest to its center of mass first."""
         object_class = picked.object_class
         config = self.config
         if object_class.mass + self._gripper.mass > self.cell.robot.payload:
             return PlanningFailure(PlanningFailureReason.TOO_HEAVY, picked.name, object_class.mass)
         sampling = GraspSampling(
-            config.grasp_spacing, config.max_grasps, config.min_payload_acceleration
+            config.grasp_spacing,
+            config.lip_gap,
+            config.max_grasps,
+            config.min_payload_acceleration,
         )
         grasps = self._gripper.sample_grasps(object_class, rigid_transform(picked.X_TO), sampling)
         if isinstance(grasps, GraspFailure):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from drake_clutter.cell.gripper import Grasp
+from drake_clutter.cell.support_sdf import FLOOR
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.collision_model import CollisionModel
 from drake_clutter.planning.pick_place_plan import (
@@ -21,7 +22,11 @@ from drake_clutter.planning.pick_place_plan import (
     TrajectorySegment,
 )
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.planning.segment_planner import EndpointContext, SegmentPlanner
+from drake_clutter.planning.segment_planner import (
+    CONTACT_TOLERANCE,
+    EndpointContext,
+    SegmentPlanner,
+)
 from drake_clutter.planning.time_parameterization import min_travel_time
 from drake_clutter.planning.tool_kinematics import (
     ToolKinematics,
@@ -82,10 +87,10 @@ class PickPlaceSearch:
             cell, config, collision_model, picked, X_TO_place, self.failures
         )
         placed = replace(picked, X_TO=X_TO_place)
-        others = [o for o in objects if o is not picked]
+        self._others = [o for o in objects if o is not picked]
         # Heights of the object's bottom: above its pick and place pose, or above a higher obstacle.
         bottom = max(picked.bounds_T[0][2], placed.bounds_T[0][2])
-        all_tops = (*obstacle_tops, *(o.top_height for o in others))
+        all_tops = (*obstacle_tops, *(o.top_height for o in self._others))
         tops = sorted({round(top, 3) for top in all_tops if top > bottom})
         lift_height = self._config.lift_height
         self._transfer_heights = [bottom + lift_height]
@@ -133,19 +138,27 @@ class PickPlaceSearch:
         """Return the endpoint at the pick pose, or None if the arm is in collision there."""
         self._segments.set_up_segment("approach", X_OG)
         p_TG_xy = (self._X_TO @ _to_matrix(X_OG))[:2, 3]
-        context = EndpointContext(p_TG_xy, {})
+        of_gripper = self._segments.distances_below_object(q, self._bodies_below(self._picked))
+        context = EndpointContext(p_TG_xy, of_gripper)
         if self._segments.min_distance_along(q[None], context, 1, "at the grasp") is None:
             return None
         self._segments.set_up_segment("carry", X_OG)
-        return EndpointContext(p_TG_xy, self._segments.contact_distances(q))
+        return EndpointContext(p_TG_xy, of_gripper | self._segments.contact_distances(q))
 
     def _place_endpoint(self, X_OG: RigidTransform, q: Floats) -> EndpointContext | None:
         """Return the endpoint at the place pose, or None in collision."""
         self._segments.set_up_segment("carry", X_OG)
         p_TG_xy = (self._X_TO_place @ _to_matrix(X_OG))[:2, 3]
-        context = EndpointContext(p_TG_xy, self._segments.contact_distances(q))
+        below = self._bodies_below(replace(self._picked, X_TO=self._X_TO_goal))
+        of_gripper = self._segments.distances_below_object(q, below)
+        context = EndpointContext(p_TG_xy, of_gripper | self._segments.contact_distances(q))
         distance = self._segments.min_distance_along(q[None], context, 2, "at the place")
         return None if distance is None else context
+
+    def _bodies_below(self, placed: SceneObject) -> frozenset[str]:
+        """Return the names of the floor and of the objects below the picked object at a pose."""
+        bottom = placed.bounds_T[0][2] + CONTACT_TOLERANCE
+        return frozenset({FLOOR, *(o.name for o in self._others if o.top_height <= bottom)})
 
     def has_candidate(self, grasp: Grasp) -> bool:
         """Return whether a grasp reaches both endpoints without collision."""
@@ -193,22 +206,26 @@ class PickPlaceSearch:
             assert place is not None
             segments = self._segments.plan_segments(grasp, X_OG, carry_path, (pick, place))
             if segments is not None:
-                return self._make_plan(X_OG, segments, q_end)
+                return self._make_plan(X_OG, segments, place, q_end)
         return None
 
     def _make_plan(
-        self, X_OG: RigidTransform, segments: tuple[TrajectorySegment, ...], q_place: Floats
+        self,
+        X_OG: RigidTransform,
+        segments: tuple[TrajectorySegment, ...],
+        place: EndpointContext,
+        q_place: Floats,
     ) -> PickPlacePlan:
-        x, y, z = (float(v) for v in invert_pose(X_OG.GetAsMatrix4())[:3, 3])
+        x, y, z = X_OG.inverse() @ self._picked.object_class.center_of_mass
         return PickPlacePlan(
             pick=self._picked.name,
             X_TO_pick=self._picked.X_TO,
             X_TO_place=self._X_TO_goal,
             X_OG=X_OG,
             mass=self._picked.object_class.mass,
-            p_GCm=(x, y, z),
+            p_GCm=(float(x), float(y), float(z)),
             segments=segments,
             num_attempts=self.num_attempts,
             planning_time=0.0,
-            guarded_descent=self._segments.plan_guarded_descent(X_OG, q_place),
+            guarded_descent=self._segments.plan_guarded_descent(X_OG, place, q_place),
         )

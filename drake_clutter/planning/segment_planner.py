@@ -4,7 +4,7 @@ Frames: T is the support, G is the gripper, O is the picked object.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -64,12 +64,13 @@ class EndpointContext:
 
     Attributes:
         p_TG_xy: Horizontal position of the gripper at the endpoint [m]. Shape (2,).
-        allowed_distances: Allowed distance at the endpoint between the attached object and each
-            body that it touches there, by name [m].
+        allowed_distances: Allowed distance of pairs at the endpoint [m]: between the attached
+            object and each body that it touches there, and between the gripper and each body below
+            a thin object, by names.
     """
 
     p_TG_xy: Floats
-    allowed_distances: Mapping[str, float]
+    allowed_distances: Mapping[tuple[str, str], float]
 
 
 class SegmentPlanner:
@@ -153,24 +154,40 @@ class SegmentPlanner:
             endpoint: Endpoint near which smaller distances are allowed.
             min_distance: Required distance of all other pairs [m].
         """
-        first, second = distance.pair
         if distance.pair in self._grasp_contacts:
             allowed = self._config.lip_gap / 2
-        elif first == self._picked.name and second in endpoint.allowed_distances:
-            allowed = endpoint.allowed_distances[second]
+        elif distance.pair in endpoint.allowed_distances:
+            allowed = endpoint.allowed_distances[distance.pair]
         else:
             return min_distance
         offset = self._collision_model.gripper_position()[:2] - endpoint.p_TG_xy
         return min(min_distance, allowed + float(np.linalg.norm(offset)))
 
-    def contact_distances(self, q: Floats) -> dict[str, float]:
-        """Return the allowed distances to neighbors of the attached object, by name [m]."""
+    def distances_below_object(self, q: Floats, below: Set[str]) -> dict[tuple[str, str], float]:
+        """Return the allowed distances between gripper and bodies below a thin object [m].
+
+        The gripper comes as close to them as the object is thin.
+
+        Args:
+            q: Joint positions at which the gripper holds the object. Shape (n,).
+            below: Names of the bodies below the object.
+        """
+        distances = self._collision_model.distances_below(q, self._config.min_distance)
+        # A body may have several geometries: the smallest distance is the last and is kept.
+        return {
+            distance.pair: max(distance.distance - CONTACT_TOLERANCE, self._config.lip_gap / 2)
+            for distance in sorted(distances, key=lambda distance: -distance.distance)
+            if distance.pair[0] in self._cell.gripper.contact_links and distance.pair[1] in below
+        }
+
+    def contact_distances(self, q: Floats) -> dict[tuple[str, str], float]:
+        """Return the allowed distances to neighbors of the attached object, by names [m]."""
         name = self._picked.name
         distances = self._collision_model.distances_below(q, self._config.min_distance)
         of_object = [distance for distance in distances if distance.pair[0] == name]
         # A neighbor may have several geometries: the smallest distance is the last and is kept.
         return {
-            distance.pair[1]: distance.distance - CONTACT_TOLERANCE
+            distance.pair: distance.distance - CONTACT_TOLERANCE
             for distance in sorted(of_object, key=lambda distance: -distance.distance)
         }
 
@@ -279,8 +296,7 @@ class SegmentPlanner:
         segment_name: str, endpoints: tuple[EndpointContext, EndpointContext]
     ) -> EndpointContext:
         """Return the endpoint of a segment on which no object is attached."""
-        endpoint = endpoints[1] if segment_name == "retreat" else endpoints[0]
-        return EndpointContext(endpoint.p_TG_xy, {})
+        return endpoints[1] if segment_name == "retreat" else endpoints[0]
 
     def _exceeds_tilt(self, path: Floats, progress: int) -> bool:
         """Return whether the tilt exceeds `MAX_CARRY_TILT`, and record that failure.
@@ -348,12 +364,26 @@ class SegmentPlanner:
             return segment
         return TrajectorySegment(segment.name, trajectory, closest, segment.unoptimized_duration)
 
-    def plan_guarded_descent(self, X_OG: RigidTransform, q_place: Floats) -> Trajectory | None:
+    def plan_guarded_descent(
+        self, X_OG: RigidTransform, place: EndpointContext, q_place: Floats
+    ) -> Trajectory | None:
         """Return the vertical descent from the place pose as far as the arm is free.
 
         The attached object is ignored: it is expected to touch something.
+
+        Args:
+            X_OG: Grasp.
+            place: Endpoint at the place pose.
+            q_place: Joint positions at the place pose. Shape (n,).
         """
         X_place = (rigid_transform(self._X_TO_place) @ X_OG).GetAsMatrix4()
+        # A thin object may be lowered until the gripper is just above what is below.
+        allowed = {
+            pair: self._config.lip_gap / 2
+            for pair in place.allowed_distances
+            if pair[0] in self._cell.gripper.contact_links
+        }
+        context = EndpointContext(place.p_TG_xy, allowed)
         path = [q_place]
         heights = np.arange(0.0, self._config.max_guarded_descent + 1e-9, _DESCENT_STEP)
         self.set_up_segment("retreat", X_OG)
@@ -363,7 +393,6 @@ class SegmentPlanner:
         for previous, height in pairwise(heights):
             X_TG = np.array([raise_pose(X_place, -previous), raise_pose(X_place, -height)])
             step = self._tool.track(X_TG, path[-1])
-            context = EndpointContext(X_place[:2, 3], {})
             if step is None or self.min_distance_along(step[1:], context, 0, "the descent") is None:
                 break
             path.append(step[1])

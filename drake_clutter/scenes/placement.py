@@ -106,13 +106,16 @@ class _OrientedObject(NamedTuple):
         quaternion: Quaternion of R_TO; unchanged if the object is not rotated.
         lowest: Height of its lowest point relative to its origin (negative) [m].
         height: Height of the object [m].
-        footprint: Grid cells relative to that of its origin that must be free, the outermost
-            first. Shape (k, 2).
+        center_of_mass: Horizontal position of the center of mass relative to the origin [m]. Shape
+            (2,).
+        footprint: Grid cells relative to that of its center of mass that must be free, the
+            outermost first. Shape (k, 2).
     """
 
     quaternion: tuple[float, float, float, float]
     lowest: float
     height: float
+    center_of_mass: NDArray[np.float64]
     footprint: NDArray[np.int64]
 
 
@@ -129,7 +132,8 @@ def _orient_object(
         np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
         @ Pose((0.0, 0.0, 0.0), quaternion).rotation
     )
-    corners = object_class.corners @ R_TO.T
+    center_of_mass = R_TO @ object_class.center_of_mass
+    corners = object_class.corners @ R_TO.T - [*center_of_mass[:2], 0.0]
     reach = int(np.ceil((np.abs(corners[:, :2]).max() + clearance) / CELL_SIZE))
     offsets = np.arange(-reach, reach + 1)
     x, y = np.meshgrid(offsets, offsets, indexing="ij")
@@ -142,7 +146,11 @@ def _orient_object(
     outermost_first = np.argsort(-np.abs(covered).max(axis=1), kind="stable")
     oriented = quaternion if yaw == 0 else Pose.from_rotation(R_TO, (0.0, 0.0, 0.0)).quaternion
     return _OrientedObject(
-        oriented, float(corners[:, 2].min()), float(np.ptp(corners[:, 2])), covered[outermost_first]
+        oriented,
+        float(corners[:, 2].min()),
+        float(np.ptp(corners[:, 2])),
+        center_of_mass[:2],
+        covered[outermost_first],
     )
 
 
@@ -205,7 +213,7 @@ def _first_free_cells(depth, camera, x, y, levels, footprint, cells, cost):  # t
         x: Centers of the grid's cells along x [m]. Shape (n,).
         y: Centers of the grid's cells along y [m]. Shape (m,).
         levels: Heights that must be free [m].
-        footprint: Cells relative to that of the origin. Shape (k, 2).
+        footprint: Cells relative to that of the center of mass. Shape (k, 2).
         cells: Candidates, ordered by cost. Shape (c, 2).
         cost: Costs of the candidates. Shape (c,).
 
@@ -346,7 +354,8 @@ def _search_placements(
             # Order by cell, so that a random choice does not depend on the sorting by cost.
             best = best[np.lexsort(cells[best].T[::-1])]
             z = np.full(len(best), floor + config.release_height - oriented.lowest)
-            translations = np.column_stack([grid.centers(cells[best]), z])
+            xy = grid.centers(cells[best]) - oriented.center_of_mass
+            translations = np.column_stack([xy, z])
             return FreePlacements(translations, oriented.quaternion)
     return None
 

@@ -62,17 +62,15 @@ class _Surface(NamedTuple):
             Shape (V, 3).
         counts: Number of corners of each face. Shape (F,).
         normal: Outward normals of the faces. Shape (F, 3).
-        p_Ocm: Center of mass [m]. Shape (3,).
     """
 
     corner: Floats
     counts: Ints
     normal: Floats
-    p_Ocm: Floats
 
 
 def _hull_surface(corners: Floats) -> _Surface:
-    """Return the surface of a convex hull of uniform density.
+    """Return the surface of a convex hull.
 
     Coplanar triangles form one face.
     """
@@ -94,14 +92,7 @@ def _hull_surface(corners: Floats) -> _Surface:
         angle = np.arctan2(arms @ np.cross(normal, arms[0]), arms @ arms[0])
         faces.append(points[np.argsort(angle)])
         normals.append(normal)
-    # The center of mass is that of tetrahedra from an inner point to every triangle.
-    inner = corners[hull.vertices].mean(axis=0)
-    triangles = corners[hull.simplices] - inner
-    volumes = np.abs(np.linalg.det(triangles))
-    p_Ocm = inner + (volumes[:, None] * triangles.sum(axis=1)).sum(axis=0) / (4 * volumes.sum())
-    return _Surface(
-        np.vstack(faces), np.array([len(face) for face in faces]), np.array(normals), p_Ocm
-    )
+    return _Surface(np.vstack(faces), np.array([len(face) for face in faces]), np.array(normals))
 
 
 def _ring(radius: float, z: float, sides: int) -> Floats:
@@ -116,8 +107,7 @@ def _surface(object_class: ObjectClass) -> _Surface:
     if object_class.shape is not Shape.CYLINDER:
         return _hull_surface(object_class.corners)
     radius, half = object_class.size[0] / 2, object_class.size[2] / 2
-    surface = _hull_surface(np.vstack([_ring(radius, z, _SURFACE_SIDES) for z in (-half, half)]))
-    return surface._replace(p_Ocm=np.zeros(3))
+    return _hull_surface(np.vstack([_ring(radius, z, _SURFACE_SIDES) for z in (-half, half)]))
 
 
 def _convex_outline(points: Floats, max_corners: int) -> Floats:
@@ -197,7 +187,7 @@ def orient_shape(object_class: ObjectClass, quaternion: Sequence[float]) -> Orie
     return OrientedShape(
         fault,
         rolls,
-        com=R_TO @ surface.p_Ocm,
+        com=R_TO @ object_class.center_of_mass,
         bottom=_convex_outline(bottom, RIM_CORNERS) if len(bottom) else empty[:, :2],
         top=top[:, :2] if len(top) < 3 else _convex_outline(top, RIM_CORNERS),
         bottom_z=float(bottom[:, 2].mean() if len(bottom) else corner[:, 2].min()),

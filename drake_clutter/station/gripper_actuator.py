@@ -13,7 +13,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
-from drake_clutter.cell.suction import MAX_SEAL_GAP, lip_surface_profile
+from drake_clutter.cell.suction import lip_surface_profile
 from drake_clutter.station.clutter_station import ClutterStation
 
 GRIPPER_UPDATE_PERIOD = 0.01
@@ -151,8 +151,7 @@ class SuctionActuator:
         if not gaps:
             return
         closest = min(gaps, key=lambda name: gaps[name])
-        can_attach = suction.can_attach(station.object_classes[closest], X_OG[closest])
-        if gaps[closest] <= MAX_SEAL_GAP and can_attach:
+        if suction.can_attach(station.object_classes[closest], X_OG[closest]):
             station.grasp.attach(context, station.scene_plant.bodies[closest])
             self.status = replace(self.status, held=closest, last_held=closest)
             self._X_OG = X_OG[closest]
