@@ -152,7 +152,7 @@ def _run_closed_loop(case: Case, perception: str) -> list[Line]:
     scene = _scene(case)
     loop = ClosedLoop(
         scene,
-        perceive=make_perception(scenario, scene.support),
+        perceive=make_perception(scenario, scene),
         seed=scenario.seed,
         config=scenario.world,
         record_motion=True,
@@ -176,7 +176,7 @@ def images(case: Case) -> list[Line]:
     """Run an episode with teleported moves and detections in depth images."""
     scenario = _scenario(case, "depth")
     scene = _scene(case)
-    perceive = make_perception(scenario, scene.support)
+    perceive = make_perception(scenario, scene)
     assert perceive is not None
     backend = ImageBackend(scene, perceive, seed=scenario.seed, config=scenario.world)
     policy = make_policy(scenario.agent, scenario.world)

@@ -167,7 +167,7 @@ class EpisodeRunner:
         self, scene: Scene, scenario: Scenario, motion: str
     ) -> tuple[ExplorationTask, tuple[SceneObject, ...], float]:
         """Return the episode, the agent's list of objects, and the robot's time [s]."""
-        perceive = make_perception(scenario, scene.support)
+        perceive = make_perception(scenario, scene)
         policy = self._make_policy(scenario.agent)
         backend: ClosedLoop | ImageBackend
         if motion == "arm":

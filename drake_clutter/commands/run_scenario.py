@@ -12,7 +12,7 @@ from drake_clutter.files import InputError, write_text
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene, save_scene
 from drake_clutter.systems.closed_loop import ClosedLoop, Timing
-from drake_clutter.systems.scenario import Scenario, make_perception, make_policy
+from drake_clutter.systems.scenario import Scenario, class_names, make_perception, make_policy
 from drake_clutter.tasks.arm_reachability_bound import ArmReachabilityBound
 from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration_task import ExplorationTask, TerminationReason
@@ -79,8 +79,8 @@ def run_closed_loop(
     Returns:
         The episode, and the times that it took.
     """
-    policy = make_policy(scenario.agent, scenario.world)
-    perceive = make_perception(scenario, scene.support)
+    policy = make_policy(scenario.agent, scenario.world, class_names(scene))
+    perceive = make_perception(scenario, scene)
     closed_loop = ClosedLoop(
         scene,
         perceive=perceive,

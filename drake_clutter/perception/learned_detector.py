@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.support import Support
+from drake_clutter.files import InputError
 from drake_clutter.perception.hypothesis_refinement import (
     MIN_SEGMENT_CELLS,
     Mask,
@@ -158,7 +159,16 @@ class LearnedDetector:
             classes: Classes to detect; the network must have been trained with all of them.
             camera: Camera of the images.
             support: Support of the objects.
+
+        Raises:
+            InputError: The network was not trained with one of the classes.
         """
+        unknown = sorted({c.name for c in classes} - set(network.classes))
+        if unknown:
+            raise InputError(
+                f"the detector was not trained with {', '.join(unknown)}; "
+                "train one with your objects by training/train_detector.py"
+            )
         self._network = network
         self._camera = camera
         self._support = support

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.support import Support
+from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import (
     learner_tensors,
     load_tensors,
@@ -96,7 +97,15 @@ def make_example(
         window: Part of the image that the network sees.
         rng: Random generator of the augmentations; None: no augmentations.
         use_color: Whether the input has color channels.
+
+    Raises:
+        InputError: The image shows an object of another class.
     """
+    unknown = sorted(set(image.classes) - set(classes))
+    if unknown:
+        raise InputError(
+            f"images: show {', '.join(unknown)}; expected objects of {', '.join(classes)} alone"
+        )
     depth = image.depth if rng is None else add_depth_noise(image.depth, rng)
     p_TP = backproject_window(depth, camera, window)
     color = image.color[window.rows, window.columns]

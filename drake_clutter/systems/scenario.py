@@ -1,15 +1,16 @@
 """Configuration of one closed-loop episode, and the detector and policy that it names."""
 
+from collections.abc import Collection
 from dataclasses import field
 from pathlib import Path
 
 from drake_clutter.agents.explorers import BASELINE_POLICIES, ORACLE, make_policy_factory
 from drake_clutter.catalog import load_catalog
-from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.pretrained import checkpoint_path
 from drake_clutter.perception.depth_noise import DepthNoise
+from drake_clutter.scenes.scene import Scene
 from drake_clutter.systems.perception_system import LearnedPerception, PerceptionFn
 from drake_clutter.tasks.belief import Policy
 from drake_clutter.validation import Count, NodeCount, Seed, config_class, renamed_fields
@@ -54,18 +55,19 @@ PRETRAINED_DETECTORS = {
 """Checkpoints of the shipped detectors, by name."""
 
 
-def make_perception(scenario: Scenario, support: Support) -> PerceptionFn | None:
+def make_perception(scenario: Scenario, scene: Scene) -> PerceptionFn | None:
     """Return the learned detector that a scenario names.
 
     Args:
         scenario: The scenario.
-        support: Support of the objects.
+        scene: The scene.
 
     Returns:
         The detector; None for ground-truth labels.
 
     Raises:
-        InputError: There is no such detector.
+        InputError: There is no such detector, the object set lacks a class of the scene, or the
+            detector was not trained with a class of the set.
     """
     if scenario.perception == "labels":
         return None
@@ -80,25 +82,42 @@ def make_perception(scenario: Scenario, support: Support) -> PerceptionFn | None
 
     catalog = load_catalog(Path(scenario.catalog) if scenario.catalog else None)
     classes = catalog.object_set(scenario.objects)
+    missing = sorted(class_names(scene) - {c.name for c in classes})
+    if missing:
+        raise InputError(
+            f"objects: {scenario.objects}; expected a set with all classes of the scene, which"
+            f" contains {', '.join(missing)}"
+        )
     camera = scenario.world.cell.camera
-    detector = LearnedDetector(SegmentationNetwork.load(path), classes, camera, support)
+    network = SegmentationNetwork.load(path)
+    try:
+        detector = LearnedDetector(network, classes, camera, scene.support)
+    except InputError as error:
+        raise InputError(f"perception: {scenario.perception}: {error}") from error
     noise = DepthNoise(focal_length=camera.focal_length) if camera.depth_noise else None
     return LearnedPerception(detector.detect, noise=noise, seed=scenario.seed)
 
 
-def make_policy(name: str, config: ClutterConfig) -> Policy:
+def class_names(scene: Scene) -> set[str]:
+    """Return the names of the object classes of a scene."""
+    return {o.object_class.name for o in scene.objects}
+
+
+def make_policy(name: str, config: ClutterConfig, classes: Collection[str] = ()) -> Policy:
     """Return the policy of an explorer that uses only observations.
 
     Args:
         name: Name of an explorer, or file of a checkpoint.
         config: Config of the world.
+        classes: Names of the object classes that will occur, as far as they are known.
 
     Raises:
-        InputError: There is no such explorer, or it uses the true state of the scene.
+        InputError: There is no such explorer, it uses the true state of the scene, or it was not
+            trained with one of the classes.
     """
     if name in BASELINE_POLICIES:
         return BASELINE_POLICIES[name]
-    factory = None if name == ORACLE else make_policy_factory(name, config)
+    factory = None if name == ORACLE else make_policy_factory(name, config, classes)
     if factory is not None:
         # This import needs PyTorch.
         from drake_clutter.agents.learned_explorer import LearnedExplorerFactory
