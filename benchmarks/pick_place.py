@@ -41,6 +41,7 @@ from drake_clutter.scenes.scene import Scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.drake_judge import DrakeJudge
 from drake_clutter.station.arm_executor import ArmExecutor, worst_instability
+from drake_clutter.station.grasp_constraint import WeldPair
 from drake_clutter.station.station_simulation import PickPlaceResult, StationSimulation
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.tasks.belief import legal_moves
@@ -368,13 +369,14 @@ def timing(
             stopwatch.seconds["optimised plan"].pop()
             return False
         q = sample_path(plan.segments[1].trajectory)
-        poses = planner.tool.pose(q)
+        tool = planner.tools[plan.tool]
+        poses = tool.pose(q)
         stopwatch.measure(
-            "forward kinematics of a pose", lambda: planner.tool.robot.forward_kinematics(q), len(q)
+            "forward kinematics of a pose", lambda: planner.robot.forward_kinematics(q), len(q)
         )
         stopwatch.measure(
             "inverse kinematics of a pose, eight branches",
-            lambda: planner.tool.solve_ik(poses),
+            lambda: tool.solve_ik(poses),
             len(q),
         )
         stopwatch.measure(
@@ -429,8 +431,8 @@ def grasp_constraints(
             walls = list[float]()
             for scene, plan in progress(plans, f"{kind}, {constraint}"):
                 start = time.perf_counter()
-                weldable = plan.pick if constraint == "WeldGrasp" else ""
-                simulation = StationSimulation(default_cell(), scene, weldable_object=weldable)
+                weld = WeldPair(plan.pick, plan.tool) if constraint == "WeldGrasp" else None
+                simulation = StationSimulation(default_cell(), scene, weld=weld)
                 results.append(simulation.execute(plan))
                 walls.append(time.perf_counter() - start)
             rows.append(

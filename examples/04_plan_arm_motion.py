@@ -35,7 +35,7 @@ def main(out: Path) -> None:
     print(f"simulated: {result}; largest load {result.max_load_ratio:.0%} of what the cup bears")
 
     arms = [sample.arm for sample in result.motion if sample.arm is not None]
-    rows = [(*arm.q, *arm.v, *arm.torque, arm.suction) for arm in arms]
+    rows = [(*arm.q, *arm.v, *arm.torque, bool(arm.tool)) for arm in arms]
     times = [sample.time for sample in result.motion]
     out.parent.mkdir(parents=True, exist_ok=True)
     np.savetxt(out, np.column_stack([times, rows]), "%.5f", delimiter=",")

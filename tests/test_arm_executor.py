@@ -31,6 +31,7 @@ from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.station.arm_executor import ArmExecutor, evaluate_outcome
 from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.command_schedule import DWELL_TIME, build_command_schedule
+from drake_clutter.station.grasp_constraint import WeldPair
 from drake_clutter.station.messages import ExecutorStatus, PlannedMove
 from drake_clutter.station.pick_place_executor import PickPlaceExecutor
 from drake_clutter.station.station_simulation import PickPlaceResult, StationSimulation
@@ -40,6 +41,7 @@ SCENE = scene_of(
     resting("tomato_soup_can", xy=(0.08, 0.0)),
     resting("pudding_box", xy=(-0.15, 0.1)),
 )
+FIRST_TOOL = next(iter(DEFAULT_CELL.gripper.tools))
 PLACE = Pose((0.2, -0.2, 0.0885), SCENE["sugar_box"].X_TO.quaternion)
 
 
@@ -55,11 +57,9 @@ def plan() -> PickPlacePlan:
 
 
 def run(
-    plan: PickPlacePlan, cell: WorkCell | None = None, weldable_object: str = ""
+    plan: PickPlacePlan, cell: WorkCell | None = None, weld: WeldPair | None = None
 ) -> PickPlaceResult:
-    return StationSimulation(cell or DEFAULT_CELL, SCENE, weldable_object=weldable_object).execute(
-        plan
-    )
+    return StationSimulation(cell or DEFAULT_CELL, SCENE, weld=weld).execute(plan)
 
 
 def test_an_object_is_placed_at_its_place_pose(plan: PickPlacePlan) -> None:
@@ -78,7 +78,7 @@ def test_an_object_is_placed_at_its_place_pose(plan: PickPlacePlan) -> None:
 
 
 def test_a_weld_grasp_does_not_slip(plan: PickPlacePlan) -> None:
-    result = run(plan, weldable_object=plan.pick)
+    result = run(plan, weld=WeldPair(plan.pick, plan.tool))
     assert result.grasped
     assert result.slip < 1e-9
 
@@ -87,7 +87,7 @@ def test_an_object_is_dropped_if_the_vacuum_is_too_weak(plan: PickPlacePlan) -> 
     """The plan assumes a vacuum of 80 %; the simulation has 10 %, or 5 N for a weight of 5 N."""
     result = run(plan, cell_with("gripper.vacuum=0.1"))
     assert result.grasped
-    on = build_command_schedule(plan, DEFAULT_CELL).suction_on_time
+    on = build_command_schedule(plan, DEFAULT_CELL).grasp_time
     assert on < result.drop_time < on + DWELL_TIME + 0.5, "as soon as it is lifted"
     assert result.position_error > 0.2
 
@@ -121,8 +121,8 @@ def test_stages_of_the_command_schedule(plan: PickPlacePlan) -> None:
     ]
     assert schedule.end_time == pytest.approx(plan.duration + 2 * DWELL_TIME)
     assert schedule.stage_at(0.0) == "approach"
-    assert schedule.stage_at(schedule.suction_on_time) == "grasp"
-    assert schedule.stage_at(schedule.suction_off_time + 0.01) == "release"
+    assert schedule.stage_at(schedule.grasp_time) == "grasp"
+    assert schedule.stage_at(schedule.release_time + 0.01) == "release"
     assert schedule.stage_at(schedule.end_time) == "idle"
     home = np.concatenate([DEFAULT_CELL.robot.home, np.zeros(6)])
     assert schedule.command.value(0.0).ravel()[:12] == pytest.approx(home, abs=1e-3)
@@ -175,12 +175,12 @@ def test_a_guarded_descent_without_an_object_ends_at_once(plan: PickPlacePlan) -
     assert result.lowered_distance < 0.002
 
 
-@pytest.mark.parametrize("weldable_object", ["", "sugar_box"])
-def test_visual_geometry_has_the_poses_of_the_bodies(weldable_object: str) -> None:
+@pytest.mark.parametrize("weld", [None, WeldPair("sugar_box", FIRST_TOOL)])
+def test_visual_geometry_has_the_poses_of_the_bodies(weld: WeldPair | None) -> None:
     classes = [(o.name, o.object_class) for o in SCENE.objects]
     options: dict[str, Any] = {
         "time_step": 0.01,
-        "weldable_object": weldable_object,
+        "weld": weld,
         "visuals": True,
     }
     station = ClutterStation(DEFAULT_CELL, classes, **options)
@@ -205,7 +205,7 @@ def test_an_executor_without_a_plan_commands_the_home_configuration() -> None:
     assert executor.GetOutputPort("command").Eval(context)[:6] == pytest.approx(
         DEFAULT_CELL.robot.home
     )
-    assert executor.GetOutputPort("suction").Eval(context)[0] == 0
+    assert executor.GetOutputPort("hold").Eval(context)[0] == 0
     assert executor.GetOutputPort("status").Eval(context) == ExecutorStatus()
 
 
@@ -219,7 +219,7 @@ def test_a_cloned_context_continues_identically(plan: PickPlacePlan) -> None:
     clone = Simulator(executor, simulator.get_context().Clone())
     simulator.AdvanceTo(2.0)
     clone.AdvanceTo(2.0)
-    for port in ("command", "suction"):
+    for port in ("command", "hold"):
         first, second = (
             executor.GetOutputPort(port).Eval(s.get_context()) for s in (simulator, clone)
         )

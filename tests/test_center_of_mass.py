@@ -54,22 +54,23 @@ def test_the_cup_holds_above_the_center_of_mass(classes: dict[str, ObjectClass])
     sampling = GraspSampling(
         spacing=0.012, lip_gap=0.0005, max_grasps=9, min_payload_acceleration=0.3
     )
-    cup = SuctionGripper()
-    grasps = cup.sample_grasps(classes["carton"], RigidTransform([0.3, 0.1, 0.1]), sampling)
+    suction = SuctionGripper.model_validate({"cup_diameter": 0.025})
+    grasps = suction.sample_grasps(classes["carton"], RigidTransform([0.3, 0.1, 0.1]), sampling)
     assert not isinstance(grasps, GraspFailure)
     payload = grasps[0].payload
     # 30 mm lie between the grasps at 24 and 36 mm, as far from both.
-    lever = grasps[0].p_TG[0] - 0.330
+    p_TG = grasps[0].X_TG.translation()
+    lever = p_TG[0] - 0.330
     assert abs(lever) == pytest.approx(0.006)
-    assert grasps[0].p_TG[1:] == pytest.approx([0.1, 0.2])
-    assert payload.p_GCm == (0.0, 0.0, 0.16)
-    expected = cup.max_acceleration(0.4, np.array([lever, 0.0, 0.16]))
+    assert p_TG[1:] == pytest.approx([0.1, 0.2])
+    assert payload.p_FCm == pytest.approx((0.0, 0.0, 0.2223 + 0.16))
+    expected = suction.max_acceleration("single", 0.4, np.array([lever, 0.0, 0.16]))
     assert payload.max_acceleration == pytest.approx(expected, abs=0.051)
     # At rest, weight and bending open the lip of radius 12.5 mm.
     force = np.array([0.0, 0.0, 0.4 * 9.81])
     bending = np.array([0.0, 0.4 * 9.81 * 0.006, 0.0])
-    opening = 0.4 * 9.81 * (1 + 2 * 0.006 / 0.0125) / cup.holding_force
-    assert cup.load_ratio(force, bending) == pytest.approx(opening)
+    opening = 0.4 * 9.81 * (1 + 2 * 0.006 / 0.0125) / suction.holding_force("single")
+    assert suction.load_ratio("single", force, bending) == pytest.approx(opening)
 
 
 def test_a_plan_knows_the_center_of_mass(classes: dict[str, ObjectClass]) -> None:
@@ -77,8 +78,9 @@ def test_a_plan_knows_the_center_of_mass(classes: dict[str, ObjectClass]) -> Non
     planner = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(optimize=False))
     plan = planner.plan([carton], "carton", carton.X_TO.translated((0.0, 0.2, 0.001)))
     assert isinstance(plan, PickPlacePlan)
-    assert plan.p_GCm[2] == pytest.approx(0.16 + PlannerConfig().lip_gap, abs=1e-9)
-    assert np.hypot(*plan.p_GCm[:2]) == pytest.approx(0.006, abs=1e-9)
+    x, y, z = DEFAULT_CELL.gripper.tools[plan.tool].X_FG.inverse() @ np.array(plan.payload.p_FCm)
+    assert z == pytest.approx(0.16 + PlannerConfig().lip_gap, abs=1e-9)
+    assert np.hypot(x, y) == pytest.approx(0.006, abs=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -296,7 +296,7 @@ def test_scenario_files_and_invalid_scenarios(config: ClutterConfig, tmp_path: P
         Scenario(), tmp_path / "scenario.yaml", ["arm.payload=5"], upgrade_config
     )
     cell = scenario.world.cell
-    assert (cell.robot.base.translation, cell.robot.payload, cell.gripper.cup_diameter) == (
+    assert (cell.robot.base.translation, cell.robot.payload, cell.gripper.cups[0].diameter) == (
         (-0.65, 0.0, 0.3),
         5.0,
         0.015,

@@ -313,7 +313,7 @@ def detector_checkpoint(folder: Path) -> Reader:
 
 def trajectory_file(folder: Path) -> Reader:
     path = folder / "trajectory.h5"
-    arm = ArmState((0.1,) * 6, (0.0,) * 6, (1.0,) * 6, True)
+    arm = ArmState((0.1,) * 6, (0.0,) * 6, (1.0,) * 6, "single")
     motion = tuple(MotionSample(0.1 * k, SCENE.poses, arm) for k in range(3))
     outcome = Outcome(MoveResult.PLACED, SCENE, motion=motion)
     write_trajectories(path, SCENE, [(Move(SCENE.names[0]), outcome)], DEFAULT_CELL)

@@ -353,7 +353,7 @@ def test_invalid_targets(text: str, message: str, tmp_path: Path) -> None:
     [
         (
             "{suction: {cup_diameter: 1.0}}",
-            "gripper.cup_diameter: 1.0; expected a finite number from 0.005 to 0.1",
+            r"gripper\.cups\[0\]\.diameter: 1\.0; expected a finite number from 0\.005 to 0\.1",
         ),
         ("{base: [0, 0]}", "base: is unknown"),
         (

@@ -90,7 +90,7 @@ def highest(plan: PickPlacePlan) -> float:
     """Return the greatest height of the cup during the transport [m]."""
     carry = plan.segments[1]
     q = carry.trajectory.vector_values(np.linspace(0, carry.duration, 40)).T
-    return float(ToolKinematics(DEFAULT_CELL).pose(q)[:, 2, 3].max())
+    return float(ToolKinematics(DEFAULT_CELL, plan.tool).pose(q)[:, 2, 3].max())
 
 
 def test_plans_avoid_occluded_boxes() -> None:

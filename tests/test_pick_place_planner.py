@@ -69,7 +69,7 @@ def test_segments_are_continuous_from_home_to_home(plan: PickPlacePlan) -> None:
 
 
 def test_gripper_and_object_reach_their_target_poses(plan: PickPlacePlan) -> None:
-    carry, tool = plan.segments[1].trajectory, ToolKinematics(DEFAULT_CELL)
+    carry, tool = plan.segments[1].trajectory, ToolKinematics(DEFAULT_CELL, plan.tool)
     X_TG_pick, X_TG_place = (tool.pose(carry.value(t).ravel()) for t in (0.0, carry.end_time()))
     assert X_TG_pick[2, 3] == pytest.approx(0.175 + PlannerConfig().lip_gap, abs=1e-6), (
         "the top of the sugar box"
@@ -86,7 +86,7 @@ def assert_collision_free(plan: PickPlacePlan, objects: list[SceneObject]) -> No
     for phase in plan.segments:
         scene.set_object_poses(objects)
         if phase.name == "carry":
-            scene.attach_object(plan.pick, plan.X_OG)
+            scene.attach_object(plan.pick, plan.tool, plan.X_OG)
         else:
             scene.set_object_pose(
                 plan.pick, plan.X_TO_pick if phase.name == "approach" else plan.X_TO_place
@@ -96,7 +96,7 @@ def assert_collision_free(plan: PickPlacePlan, objects: list[SceneObject]) -> No
             for here in scene.distances_below(phase.trajectory.value(time).ravel(), 0.03):
                 if here.pair == (plan.pick, "floor"):
                     assert here.distance > -0.001
-                elif here.pair == ("cup", plan.pick):
+                elif here.pair == (f"{plan.tool}_cup", plan.pick):
                     assert here.distance > -0.0005, (
                         "the lip, which is on a spring, hardly goes into the face"
                     )
@@ -224,7 +224,7 @@ def test_distance_gradients_equal_finite_differences(plan: PickPlacePlan) -> Non
     model = planner().collision_model(PILE)
     step = 1e-4
     generator = rng(0)
-    model.attach_object(plan.pick, plan.X_OG)
+    model.attach_object(plan.pick, plan.tool, plan.X_OG)
     errors: dict[bool, list[float]] = {True: [], False: []}  # of pairs with a cylinder, and without
     for time in np.linspace(0.0, plan.segments[1].duration, 15):
         q = plan.segments[1].trajectory.value(time).ravel() + generator.normal(0, 0.1, 6)

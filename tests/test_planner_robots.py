@@ -58,7 +58,7 @@ def samples(phase: TrajectorySegment, order: int = 0) -> np.ndarray:
 
 
 def assert_limits(planner: PickPlacePlanner, plan: PickPlacePlan) -> None:
-    robot, loaded = planner.tool.robot, Payload(plan.mass, plan.p_GCm)
+    robot, loaded = planner.robot, plan.payload
     lower, upper = robot.position_limits.T
     for phase in plan.segments:
         q, v, a = (samples(phase, order) for order in range(3))
@@ -78,19 +78,19 @@ def assert_collision_free(planner: PickPlacePlanner, plan: PickPlacePlan) -> Non
     for phase in plan.segments:
         scene.set_object_poses(PILE)
         if phase.name == "carry":
-            scene.attach_object(plan.pick, plan.X_OG)
+            scene.attach_object(plan.pick, plan.tool, plan.X_OG)
         else:
             X_TO = plan.X_TO_pick if phase.name == "approach" else plan.X_TO_place
             scene.set_object_pose(plan.pick, X_TO)
         for q in samples(phase):
             for here in scene.distances_below(q, 0.0):
-                touching = here.pair in (("cup", plan.pick), (plan.pick, "floor"))
+                touching = here.pair in ((f"{plan.tool}_cup", plan.pick), (plan.pick, "floor"))
                 assert touching, f"{phase.name}: {here}"
                 assert here.distance > -0.001
 
 
 def assert_endpoints(planner: PickPlacePlanner, plan: PickPlacePlan) -> None:
-    home = planner.tool.robot.home
+    home = planner.robot.home
     approach, carry, retreat = (phase.trajectory for phase in plan.segments)
     assert approach.value(0.0).ravel() == pytest.approx(home)
     assert retreat.value(retreat.end_time()).ravel() == pytest.approx(home)
@@ -98,7 +98,8 @@ def assert_endpoints(planner: PickPlacePlanner, plan: PickPlacePlan) -> None:
         assert first.value(first.end_time()) == pytest.approx(second.value(0.0), abs=1e-9)
     for time, X_TO in ((0.0, plan.X_TO_pick), (carry.end_time(), plan.X_TO_place)):
         expected = (rigid_transform(X_TO) @ plan.X_OG).GetAsMatrix4()
-        assert planner.tool.pose(carry.value(time).ravel()) == pytest.approx(expected, abs=1e-6)
+        X_TG = planner.tools[plan.tool].pose(carry.value(time).ravel())
+        assert pytest.approx(expected, abs=1e-6) == X_TG
 
 
 @pytest.mark.parametrize("optimize", [False, True])
@@ -114,7 +115,7 @@ def test_plans_of_other_robots_are_feasible(name: str, optimize: bool) -> None:
         assert_limits(planner, plan)
         assert_collision_free(planner, plan)
         assert_endpoints(planner, plan)
-        axis = planner.tool.axis(samples(plan.segments[1]))
+        axis = planner.tools[plan.tool].axis(samples(plan.segments[1]))
         tilt = np.arctan2(np.hypot(axis[:, 0], axis[:, 1]), -axis[:, 2])
         assert np.degrees(tilt).max() < 1.0
         assert plan.duration < (0.95 if optimize else 1.01) * plan.unoptimized_duration
@@ -132,7 +133,7 @@ def test_other_robots_plan_guarded_descents(name: str) -> None:
     q = plan.guarded_descent.vector_values(np.linspace(0.0, plan.guarded_descent.end_time(), 20)).T
     carry = plan.segments[1].trajectory
     assert q[0] == pytest.approx(carry.value(carry.end_time()).ravel(), abs=1e-9)
-    p_TG = planner.tool.pose(q)[:, :3, 3]
+    p_TG = planner.tools[plan.tool].pose(q)[:, :3, 3]
     assert np.abs(p_TG[:, :2] - p_TG[0, :2]).max() < 1e-4
     assert p_TG[0, 2] - p_TG[-1, 2] == pytest.approx(plan.max_descent, abs=1e-4)
 
@@ -143,7 +144,7 @@ def test_distance_gradients_of_seven_joints() -> None:
     step = 1e-5
     scene, checked = planner.collision_model(PILE[:2]), 0
     for _ in range(20):
-        q = planner.tool.robot.home + generator.normal(0.0, 0.2, 7)
+        q = planner.robot.home + generator.normal(0.0, 0.2, 7)
         for here, gradient in scene.distances_and_gradients(q, 0.3):
             sides = []
             for joint in range(7):
@@ -176,7 +177,7 @@ def test_fixtures_of_the_cell_are_avoided() -> None:
     def nearest(plan: PickPlacePlan | PlanningFailure) -> float:
         assert isinstance(plan, PickPlacePlan)
         scene = between.collision_model([box])
-        scene.attach_object(box.name, plan.X_OG)
+        scene.attach_object(box.name, plan.tool, plan.X_OG)
         found = [here for q in samples(plan.segments[1]) for here in scene.distances_below(q, 0.3)]
         return min(here.distance for here in found if here.pair[1] == "wall")
 

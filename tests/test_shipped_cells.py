@@ -95,7 +95,8 @@ def test_the_gripper_reaches_the_tray(name: str, share: float) -> None:
     cell = cell_of(name)
     robot = load_robot(cell.robot)
     distance = clearance(cell, robot, with_view=False)
-    X_BT, X_GF = cell.robot.X_TB.inverse(), cell.gripper.X_FG.inverse()
+    tool = next(iter(cell.gripper.tools.values()))
+    X_BT, X_GF = cell.robot.X_TB.inverse(), tool.X_FG.inverse()
     x, y = cell.support.half_size - 0.05
     reached, heights = [], (0.03, 0.2, 0.35)
     for p_TG in product(np.linspace(-x, x, 5), np.linspace(-y, y, 5), heights):

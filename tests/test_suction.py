@@ -6,12 +6,15 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
-from conftest import CLASSES, DEFAULT_CELL, resting
+from conftest import CLASSES, DEFAULT_CELL, cell_with, resting
 from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
 
 from drake_clutter.assets import build_assets
 from drake_clutter.catalog import ObjectClass, RestOrientation, Shape, load_catalog
@@ -24,11 +27,57 @@ from drake_clutter.cell.suction import (
     lip_surface_profile,
     payload_wrench,
 )
+from drake_clutter.files import InputError
 from drake_clutter.simulation.scene_plant import rigid_transform
+from drake_clutter.validation import validate
 
-CUP = SuctionGripper()
+SUCTION = SuctionGripper.model_validate({"cup_diameter": 0.025})
+CUP = SUCTION.cups[0]
 ALONG_MINUS_X = RotationMatrix(np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]))
 SAMPLING = GraspSampling(spacing=0.012, lip_gap=0.0005, max_grasps=9, min_payload_acceleration=0.3)
+
+
+def test_fields_of_a_single_cup_change_or_replace_the_cups() -> None:
+    """Files of earlier versions have them; several settings add up."""
+    (cup,) = cell_with("gripper.cup_diameter=0.015", "gripper.extension=0.2").gripper.cups
+    assert (cup.diameter, cup.extension, cup.length) == (0.015, 0.2, 0.020)
+    assert cup.X_FG.transform.translation() == pytest.approx([0.0, 0.0, 0.1023 + 0.2 + 0.020])
+
+
+def two_cups(**small: Any) -> SuctionGripper:
+    cups = [dict(CUP), {"name": "small", "X_FG": {"translation": [0.0, 0.05, 0.2143]}, **small}]
+    return validate(SuctionGripper, {"cups": cups}, "gripper")
+
+
+@pytest.mark.parametrize(
+    ("small", "message"),
+    [
+        ({"name": "single"}, "single: a cup's name; expected names that differ"),
+        ({"name": "a b"}, r"cups\[1\]\.name: 'a b'; expected"),
+        ({"diameter": 0.001}, r"cups\[1\]\.diameter: 0\.001; expected .* from 0\.005 to 0\.1"),
+        ({"tilt": 1}, r"cups\[1\]\.tilt: is unknown"),
+    ],
+)
+def test_invalid_cups(small: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        two_cups(**small)
+
+
+def test_the_model_of_a_gripper_has_a_frame_and_a_mass_for_each_cup() -> None:
+    gripper = two_cups(diameter=0.01, length=0.012, extension=0.1, tube_radius=0.005)
+    plant = MultibodyPlant(0.0)
+    Parser(plant).AddModelsFromString(gripper.model_sdf(compliant=False), "sdf")
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("body"))
+    plant.Finalize()
+    context = plant.CreateDefaultContext()
+    for tool in gripper.tools.values():
+        X_FG = plant.GetFrameByName(tool.link).CalcPoseInWorld(context)
+        assert X_FG.IsNearlyEqualTo(tool.X_FG, 1e-9)
+    bar = 2700.0 * math.pi * 0.008**2 * 0.05
+    tubes = 0.05 + 0.05 * 0.5**2
+    cups = 0.02 + 0.02 * (0.01 / 0.025) ** 2
+    assert gripper.mass == pytest.approx(0.71 + bar + tubes + cups)
+    assert plant.CalcTotalMass(context) == pytest.approx(gripper.mass, rel=1e-4)
 
 
 def on_top(height: float, x: float = 0.0, tilt: float = 0.0) -> RigidTransform:
@@ -40,20 +89,16 @@ def on_top(height: float, x: float = 0.0, tilt: float = 0.0) -> RigidTransform:
 
 def test_a_flat_face_seals() -> None:
     box, can = CLASSES["cracker_box"], CLASSES["tomato_soup_can"]
-    assert lip_flatness_deviation(box, on_top(0.115), CUP.cup_diameter) == pytest.approx(
-        0.0, abs=1e-12
-    )
+    assert lip_flatness_deviation(box, on_top(0.115), CUP.diameter) == pytest.approx(0.0, abs=1e-12)
     assert lip_flatness_deviation(
-        can, on_top(0.0505, x=0.033 - 0.0130), CUP.cup_diameter
+        can, on_top(0.0505, x=0.033 - 0.0130), CUP.diameter
     ) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_an_edge_does_not_seal() -> None:
     """The rim of a can, and a face that is narrower than the cup, do not seal."""
     assert (
-        lip_flatness_deviation(
-            CLASSES["tomato_soup_can"], on_top(0.0505, x=0.025), CUP.cup_diameter
-        )
+        lip_flatness_deviation(CLASSES["tomato_soup_can"], on_top(0.0505, x=0.025), CUP.diameter)
         == math.inf
     )
     onto_side = np.array([[0.0, 1, 0], [0, 0, -1], [-1, 0, 0]]).T  # 28 mm deep
@@ -64,9 +109,9 @@ def test_an_edge_does_not_seal() -> None:
 def test_tilt_and_curvature_increase_the_flatness_deviation() -> None:
     """It is d tan(a) for a tilt a, and r - sqrt(r^2 - d^2 / 4) for a cylinder of radius r."""
     found = lip_flatness_deviation(
-        CLASSES["cracker_box"], on_top(0.115, tilt=math.radians(5)), CUP.cup_diameter
+        CLASSES["cracker_box"], on_top(0.115, tilt=math.radians(5)), CUP.diameter
     )
-    assert found == pytest.approx(CUP.cup_diameter * math.tan(math.radians(5)), rel=1e-6)
+    assert found == pytest.approx(CUP.diameter * math.tan(math.radians(5)), rel=1e-6)
     side = RigidTransform(ALONG_MINUS_X, [0.033, 0.0, 0.0])
     sagitta = 0.033 - math.sqrt(0.033**2 - 0.0125**2)
     assert lip_flatness_deviation(CLASSES["tomato_soup_can"], side, 0.025) == pytest.approx(
@@ -90,40 +135,42 @@ def test_the_default_cup_is_the_widest_that_seals_on_all_objects() -> None:
                 x = np.eye(3)[(axis + 1) % 3]
                 R = RotationMatrix(np.column_stack([x, np.cross(z, x), z]))
                 X = RigidTransform(R, -z * o.size[axis] / 2)
-                if lip_flatness_deviation(o, X, diameter) > CUP.unevenness:
+                if lip_flatness_deviation(o, X, diameter) > SUCTION.unevenness:
                     return False
         return True
 
     assert [d for d in (0.015, 0.020, 0.025, 0.030, 0.040, 0.055) if seals(d)] == [
         0.015,
         0.020,
-        CUP.cup_diameter,
+        CUP.diameter,
     ]
 
 
 def test_a_marker_cannot_be_grasped() -> None:
     side = RigidTransform(ALONG_MINUS_X, [0.009, 0.0, 0.0])
     for diameter in (0.010, 0.015, 0.025, 0.040):
-        assert lip_flatness_deviation(CLASSES["large_marker"], side, diameter) > CUP.unevenness
+        assert lip_flatness_deviation(CLASSES["large_marker"], side, diameter) > SUCTION.unevenness
 
 
 def test_the_holding_force_is_pressure_times_area() -> None:
-    assert CUP.holding_force == pytest.approx(0.8 * 101_325 * math.pi * 0.0125**2)
+    assert SUCTION.holding_force("single") == pytest.approx(0.8 * 101_325 * math.pi * 0.0125**2)
 
 
 def test_load_ratios_of_simple_loads() -> None:
     zero = np.zeros(3)
-    assert CUP.load_ratio(np.array([0.0, 0.0, CUP.holding_force]), zero) == pytest.approx(1.0)
-    assert CUP.load_ratio(
-        zero, np.array([0.0, CUP.holding_force * 0.0125 / 2, 0.0])
+    assert SUCTION.load_ratio(
+        "single", np.array([0.0, 0.0, SUCTION.holding_force("single")]), zero
     ) == pytest.approx(1.0)
-    assert CUP.load_ratio(
-        np.array([CUP.friction * CUP.holding_force, 0.0, 0.0]), zero
+    assert SUCTION.load_ratio(
+        "single", zero, np.array([0.0, SUCTION.holding_force("single") * 0.0125 / 2, 0.0])
     ) == pytest.approx(1.0)
-    assert CUP.load_ratio(np.array([0.0, 0.0, -5.0]), zero) == 0.0, "a pressing force"
-    assert CUP.load_ratio(np.array([[0.0, 0, 10], [0, 0, 20]]), np.zeros((2, 3))) == pytest.approx(
-        np.array([10, 20]) / CUP.holding_force
-    )
+    assert SUCTION.load_ratio(
+        "single", np.array([SUCTION.friction * SUCTION.holding_force("single"), 0.0, 0.0]), zero
+    ) == pytest.approx(1.0)
+    assert SUCTION.load_ratio("single", np.array([0.0, 0.0, -5.0]), zero) == 0.0, "a pressing force"
+    assert SUCTION.load_ratio(
+        "single", np.array([[0.0, 0, 10], [0, 0, 20]]), np.zeros((2, 3))
+    ) == pytest.approx(np.array([10, 20]) / SUCTION.holding_force("single"))
 
 
 def test_the_wrench_of_a_load_at_rest_is_its_weight() -> None:
@@ -134,14 +181,17 @@ def test_the_wrench_of_a_load_at_rest_is_its_weight() -> None:
 
 def test_the_largest_acceleration_decreases_with_the_lever() -> None:
     """The lever is the distance of the center of mass; a load that is too heavy gives -1."""
-    low = CUP.max_acceleration(0.4, np.array([0.0, 0.0, 0.0]))
-    high = CUP.max_acceleration(0.4, np.array([0.0, 0.0, 0.15]))
+    low = SUCTION.max_acceleration("single", 0.4, np.array([0.0, 0.0, 0.0]))
+    high = SUCTION.max_acceleration("single", 0.4, np.array([0.0, 0.0, 0.15]))
     assert 0 < high < low
-    ratio = CUP.load_ratio(
-        *payload_wrench(0.4, np.array([0.0, 0.0, 0.15]), np.array([high, 0.0, 0.0]))
+    ratio = SUCTION.load_ratio(
+        "single", *payload_wrench(0.4, np.array([0.0, 0.0, 0.15]), np.array([high, 0.0, 0.0]))
     )
-    assert 0.8 / CUP.safety < ratio <= 1.001 / CUP.safety
-    assert CUP.max_acceleration(CUP.holding_force / GRAVITY, np.zeros(3)) == -1.0
+    assert 0.8 / SUCTION.safety < ratio <= 1.001 / SUCTION.safety
+    assert (
+        SUCTION.max_acceleration("single", SUCTION.holding_force("single") / GRAVITY, np.zeros(3))
+        == -1.0
+    )
 
 
 def test_grasps_are_sorted_from_the_center_of_the_top() -> None:
@@ -150,8 +200,11 @@ def test_grasps_are_sorted_from_the_center_of_the_top() -> None:
     found = gripper.sample_grasps(box.object_class, rigid_transform(box.X_TO), SAMPLING)
     assert not isinstance(found, GraspFailure)
     assert len(found) == SAMPLING.max_grasps
-    assert found[0].p_TG == pytest.approx([0.1, -0.2, box.top_height])
-    distances = [float(np.linalg.norm(grasp.p_TG - found[0].p_TG)) for grasp in found]
+    assert found[0].X_TG.translation() == pytest.approx([0.1, -0.2, box.top_height])
+    distances = [
+        float(np.linalg.norm(grasp.X_TG.translation() - found[0].X_TG.translation()))
+        for grasp in found
+    ]
     assert (np.diff(distances) > -1e-9).all()
     assert found[0].payload.mass == box.object_class.mass
     assert found[0].payload.max_acceleration >= found[-1].payload.max_acceleration >= 0.3
@@ -159,18 +212,18 @@ def test_grasps_are_sorted_from_the_center_of_the_top() -> None:
 
 def test_reasons_why_there_is_no_grasp() -> None:
     can = resting("tomato_soup_can")
-    rim = CUP.model_copy(update={"cup_diameter": 0.08})
+    rim = SuctionGripper.model_validate({"cup_diameter": 0.08})
     found = rim.sample_grasps(can.object_class, rigid_transform(can.X_TO), SAMPLING)
     assert found == GraspFailure(GraspFailureReason.NO_SEAL, math.inf)
-    weak = CUP.model_copy(update={"vacuum": 0.1})
+    weak = SUCTION.model_copy(update={"vacuum": 0.1})
     found = weak.sample_grasps(can.object_class, rigid_transform(can.X_TO), SAMPLING)
     assert found == GraspFailure(GraspFailureReason.TOO_HEAVY, can.object_class.mass)
 
 
 def test_a_cup_attaches_where_the_surface_is_flat() -> None:
     can = CLASSES["tomato_soup_can"]
-    assert CUP.can_attach(can, on_top(0.0505))
-    assert not CUP.can_attach(can, on_top(0.0505, x=0.025))
+    assert SUCTION.can_attach("single", can, on_top(0.0505))
+    assert not SUCTION.can_attach("single", can, on_top(0.0505, x=0.025))
 
 
 def own_class(folder: Path, mesh: trimesh.Trimesh) -> ObjectClass:
@@ -190,15 +243,13 @@ def revolved(outline: list[tuple[float, float]]) -> trimesh.Trimesh:
 
 def test_the_profile_of_a_mesh_is_that_of_the_box_of_its_size(tmp_path: Path) -> None:
     own = own_class(tmp_path, trimesh.creation.box((0.05, 0.06, 0.07)))
-    assert lip_flatness_deviation(own, on_top(0.035), CUP.cup_diameter) == pytest.approx(
-        0.0, abs=1e-9
-    )
-    assert lip_surface_profile(own, on_top(0.045), CUP.cup_diameter) == pytest.approx(
+    assert lip_flatness_deviation(own, on_top(0.035), CUP.diameter) == pytest.approx(0.0, abs=1e-9)
+    assert lip_surface_profile(own, on_top(0.045), CUP.diameter) == pytest.approx(
         np.full(24, 0.010), abs=1e-7
     )
-    tilted = lip_flatness_deviation(own, on_top(0.035, tilt=math.radians(5)), CUP.cup_diameter)
-    assert tilted == pytest.approx(CUP.cup_diameter * math.tan(math.radians(5)), rel=1e-5)
-    assert lip_flatness_deviation(own, on_top(0.035, x=0.02), CUP.cup_diameter) == math.inf
+    tilted = lip_flatness_deviation(own, on_top(0.035, tilt=math.radians(5)), CUP.diameter)
+    assert tilted == pytest.approx(CUP.diameter * math.tan(math.radians(5)), rel=1e-5)
+    assert lip_flatness_deviation(own, on_top(0.035, x=0.02), CUP.diameter) == math.inf
 
 
 def test_convex_pieces_that_bulge_over_a_flat_lid_do_not_break_the_seal(tmp_path: Path) -> None:
@@ -210,18 +261,18 @@ def test_convex_pieces_that_bulge_over_a_flat_lid_do_not_break_the_seal(tmp_path
     bulge = revolved([(0, 0), (0.04, 0), (0.04, 0.06), (0.01, 0.058), (0, 0.057)]).convex_hull
     bulge.apply_translation([0, 0, -0.03])
     (own.folder / "convex_000.obj").write_text(bulge.export(file_type="obj"))
-    assert lip_flatness_deviation(own, on_top(0.03), CUP.cup_diameter) == pytest.approx(
-        0.0, abs=1e-6
-    )
-    grasps = CUP.sample_grasps(own, RigidTransform([0.0, 0.0, 0.03]), SAMPLING)
+    assert lip_flatness_deviation(own, on_top(0.03), CUP.diameter) == pytest.approx(0.0, abs=1e-6)
+    grasps = SUCTION.sample_grasps(own, RigidTransform([0.0, 0.0, 0.03]), SAMPLING)
     assert not isinstance(grasps, GraspFailure)
-    assert grasps[0].p_TG == pytest.approx([0.0, 0.0, 0.06], abs=1e-6)  # where the cup touches
+    assert grasps[0].X_TG.translation() == pytest.approx(
+        [0.0, 0.0, 0.06], abs=1e-6
+    )  # where the cup touches
     # The lid is 3 mm below the piece: a gap of 1.9 mm more seals, one of 2.1 mm does not.
     for lip_gap, value in ((0.0019, None), (0.0021, 0.0051)):
-        found = CUP.sample_grasps(
+        found = SUCTION.sample_grasps(
             own, RigidTransform([0.0, 0.0, 0.03]), replace(SAMPLING, lip_gap=lip_gap)
         )
-        assert CUP.can_attach(own, on_top(0.03 + lip_gap)) is (value is None)
+        assert SUCTION.can_attach("single", own, on_top(0.03 + lip_gap)) is (value is None)
         if value is not None:
             assert isinstance(found, GraspFailure)
             assert found.reason is GraspFailureReason.NO_SEAL
@@ -235,12 +286,11 @@ def test_every_grasp_on_a_mesh_is_one_that_the_simulation_attaches(tmp_path: Pat
     bowl = [(0, 0), (0.06, 0), (0.07, 0.036), (0.066, 0.036), (0.056, 0.006), (0, 0.006)]
     own = own_class(tmp_path, revolved(bowl))
     X_TO = RigidTransform([0.1, 0.0, 0.018])
-    grasps = CUP.sample_grasps(own, X_TO, SAMPLING)
+    grasps = SUCTION.sample_grasps(own, X_TO, SAMPLING)
     assert not isinstance(grasps, GraspFailure)
     for grasp in grasps:
-        p_TG = grasp.p_TG + np.array([0.0, 0.0, SAMPLING.lip_gap])
-        X_TG = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), p_TG)
+        X_TG = grasp.X_TG @ RigidTransform([0.0, 0.0, -SAMPLING.lip_gap])
         X_OG = X_TO.InvertAndCompose(X_TG)
-        assert CUP.can_attach(own, X_OG)
-        assert lip_surface_profile(own, X_OG, CUP.cup_diameter).min() <= MAX_SEAL_GAP
-        assert grasp.p_TG[2] == pytest.approx(0.006, abs=0.003)
+        assert SUCTION.can_attach("single", own, X_OG)
+        assert lip_surface_profile(own, X_OG, CUP.diameter).min() <= MAX_SEAL_GAP
+        assert grasp.X_TG.translation()[2] == pytest.approx(0.006, abs=0.003)

@@ -69,7 +69,7 @@ def limit_ratios(trajectory: Trajectory, payload: Payload) -> dict[str, float]:
         "torque": torque / ROBOT.torque_limits,
     }
     X_FL = np.eye(4)
-    X_FL[:3, 3] = [0.0, 0.0, ARM.gripper.length + payload.p_GCm[2]]
+    X_FL[:3, 3] = payload.p_FCm
     of_load = (
         np.diff((ROBOT.forward_kinematics(q) @ X_FL)[:, :3, 3], 2, axis=0)
         / (times[1] - times[0]) ** 2
@@ -78,7 +78,7 @@ def limit_ratios(trajectory: Trajectory, payload: Payload) -> dict[str, float]:
     return {name: float(np.abs(share).max()) for name, share in pairs.items()}
 
 
-@pytest.mark.parametrize("payload", [Payload(), Payload(0.5, (0.0, 0.0, 0.1), 1.5)])
+@pytest.mark.parametrize("payload", [Payload(), Payload(0.5, (0.0, 0.0, 0.3223), 1.5)])
 def test_trajectories_satisfy_the_limits(payload: Payload) -> None:
     generator = rng(0)
     for _ in range(3):
@@ -96,7 +96,7 @@ def test_trajectories_satisfy_the_limits(payload: Payload) -> None:
         assert np.abs(trajectory.EvalDerivative(0.0, 1)).max() < 1e-3
 
 
-@pytest.mark.parametrize("payload", [Payload(), Payload(0.5, (0.0, 0.0, 0.1), 1.5)])
+@pytest.mark.parametrize("payload", [Payload(), Payload(0.5, (0.0, 0.0, 0.3223), 1.5)])
 def test_a_trajectory_is_scaled_until_one_limit_is_active(payload: Payload) -> None:
     path = bspline_path(linear_joint_path(HOME, HOME + np.array([0.8, -0.4, 0.5, 0.3, 0.0, 0.2])))
     too_fast = PathParameterizedTrajectory(

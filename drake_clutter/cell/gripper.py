@@ -1,10 +1,13 @@
 """Protocol of grippers: grasps, load capacity and SDF model.
 
-Frames: T is the support; F is the robot's flange; G is the gripper, its origin at the contact with
-the object, z out of the tool, into the object; O is the object.
+A gripper has one or more tools, each with a frame of its own: a suction cup, or a pair of jaws.
+
+Frames: T is the support; F is the robot's flange; G is a tool, its origin at the contact with the
+object, z out of the tool, into the object; O is the object.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
@@ -24,13 +27,13 @@ class Payload:
 
     Attributes:
         mass: Mass [kg].
-        p_GCm: Center of mass [m], rounded, so that cached plants can be reused. Shape (3,).
-        max_acceleration: Largest acceleration of G in any direction [m/s^2]; infinite without a
-            load.
+        p_FCm: Center of mass [m], rounded, so that cached plants can be reused. Shape (3,).
+        max_acceleration: Largest acceleration of the load in any direction [m/s^2]; infinite
+            without a load.
     """
 
     mass: float = 0.0
-    p_GCm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    p_FCm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     max_acceleration: float = math.inf
 
     @property
@@ -40,15 +43,37 @@ class Payload:
 
 
 @dataclass(frozen=True)
-class Grasp:
-    """Grasp of a gripper that points down, at any yaw.
+class Tool:
+    """Part of a gripper that can hold an object.
 
     Attributes:
-        p_TG: Position on the top of the object [m]. Shape (3,).
+        name: Name.
+        link: Link of the SDF model whose frame is G.
+        X_FG: Pose of G in the flange without load.
+        contact_links: Links that touch a grasped object.
+        compliant_joint: Index, among the joints of the gripper, of the joint along which the tool
+            yields; None if it is rigid.
+    """
+
+    name: str
+    link: str
+    X_FG: RigidTransform
+    contact_links: tuple[str, ...]
+    compliant_joint: int | None
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """Grasp of a tool at any angle about its axis.
+
+    Attributes:
+        tool: Name of the tool.
+        X_TG: Pose of the tool, with its origin on the surface of the object.
         payload: Load after the grasp.
     """
 
-    p_TG: Floats
+    tool: str
+    X_TG: RigidTransform
     payload: Payload
 
 
@@ -80,7 +105,7 @@ class GraspSampling:
     Attributes:
         spacing: Distance of neighboring grasp points [m].
         lip_gap: Gap between gripper and object when the gripper is switched on [m].
-        max_grasps: Largest number of grasps.
+        max_grasps: Largest number of grasps of a tool.
         min_payload_acceleration: A grasp must hold the object at this acceleration [m/s^2].
     """
 
@@ -98,19 +123,19 @@ class Gripper(Protocol):
         """Kind of the gripper in a cell file."""
 
     @property
+    def description(self) -> str:
+        """Kind and sizes in a few words, for reports."""
+
+    @property
     def mass(self) -> float:
         """Mass that counts towards the payload of the robot [kg]."""
 
     @property
-    def X_FG(self) -> RigidTransform:
-        """Pose of G in the flange without load."""
-
-    @property
-    def contact_links(self) -> tuple[str, ...]:
-        """Names of the links that touch a grasped object."""
+    def tools(self) -> Mapping[str, Tool]:
+        """Tools by name; the first is preferred."""
 
     def model_sdf(self, *, compliant: bool) -> str:
-        """Return the SDF model; link `body` has frame F, link `cup` has frame G.
+        """Return the SDF model; link `body` has frame F, and `Tool.link` frame G of a tool.
 
         Args:
             compliant: Whether compliant parts can move; planning uses the rigid model.
@@ -122,9 +147,9 @@ class Gripper(Protocol):
         X_TO: RigidTransform,
         sampling: GraspSampling,
     ) -> tuple[Grasp, ...] | GraspFailure:
-        """Return feasible grasps from above, the closest to the center of mass first.
+        """Return feasible grasps of an object from above, the preferred ones first.
 
-        `can_attach` holds at each of them, raised by `GraspSampling.lip_gap`.
+        `can_attach` holds at each of them, moved back by `GraspSampling.lip_gap`.
 
         Args:
             object_class: Class of the object.
@@ -132,32 +157,11 @@ class Gripper(Protocol):
             sampling: Parameters of the sampling.
         """
 
-    def can_attach(self, object_class: ObjectClass, X_OG: RigidTransform) -> bool:
-        """Return whether the gripper can attach to an object at a pose.
+    def can_attach(self, tool: str, object_class: ObjectClass, X_OG: RigidTransform) -> bool:
+        """Return whether a tool can attach to an object at a pose.
 
         Args:
+            tool: Name of the tool.
             object_class: Class of the object.
-            X_OG: Pose of the gripper in the object.
-        """
-
-    def max_acceleration(self, mass: float, p_GCm: Floats) -> float:
-        """Return the largest acceleration of a load in any direction.
-
-        Args:
-            mass: Mass of the load [kg].
-            p_GCm: Center of mass of the load [m]. Shape (3,).
-
-        Returns:
-            Acceleration including the safety factor [m/s^2]; negative if the load cannot be held.
-        """
-
-    def load_ratio(self, force: Floats, moment: Floats) -> Floats:
-        """Return the ratio of a load to the load capacity; the object detaches above 1.
-
-        Args:
-            force: Force of the object on the gripper, in G [N]. Shape (..., 3).
-            moment: Moment of the object about G, in G [N m]. Shape (..., 3).
-
-        Returns:
-            Load ratio. Shape (...).
+            X_OG: Pose of the tool in the object.
         """

@@ -1,7 +1,7 @@
-"""Suction gripper: where the cup seals on an object, and which loads it holds.
+"""Suction gripper: where its cups seal on an object, and which loads they hold.
 
-Frames: G is the gripper, its origin at the center of the cup's lip, z out of the tool, into the
-object; O is the object.
+Frames: F is the flange; G is a cup, its origin at the center of the lip, z out of the tool, into
+the object; O is the object.
 
 Sources: Body dimensions as in PickNik's `epick_description` (BSD). The vacuum of 80 % of the
 atmospheric pressure is an assumption, close to the specification of the Robotiq EPick. The lip
@@ -10,24 +10,28 @@ lip uniformly, and the lip opens where tension and bending cancel that load.
 """
 
 import math
+from collections.abc import Mapping
 from functools import lru_cache
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, field_validator, model_validator
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial import ConvexHull
 
 from drake_clutter.catalog import ObjectClass, Shape
-from drake_clutter.cell.epick import EPICK_LENGTH, EPICK_MASS, epick_sdf
+from drake_clutter.cell.epick import EPICK_LENGTH, epick_mass, epick_sdf
 from drake_clutter.cell.gripper import (
     Grasp,
     GraspFailure,
     GraspFailureReason,
     GraspSampling,
     Payload,
+    Tool,
 )
-from drake_clutter.validation import InRange, StrictModel
+from drake_clutter.cell.suction_cup import SuctionCup
+from drake_clutter.validation import InRange, StrictModel, rejected_error
 
 Floats = NDArray[np.float64]
 
@@ -55,16 +59,18 @@ _ACCELERATION_DIRECTIONS = np.array(
 """Unit vectors that sample all directions of an acceleration. Shape (26, 3)."""
 
 
+_Mismatch = tuple[bool, float]
+"""Of a profile that does not seal: whether it is uneven, and its deviation or gap [m]."""
+
+
 class SuctionGripper(StrictModel):
-    """Robotiq EPick vacuum gripper with an extension tube and a bellows suction cup.
+    """Robotiq EPick vacuum gripper with bellows suction cups on tubes.
+
+    The vacuum of each cup is switched separately.
 
     Attributes:
         kind: Kind of the gripper in a cell file.
-        cup_diameter: Diameter of the lip [m].
-        cup_length: Length of the cup without load [m].
-        extension: Length of the tube between body and cup [m].
-        stroke: Largest compression, and largest extension, of the bellows [m].
-        stiffness: Axial stiffness of the bellows [N/m].
+        cups: Suction cups; the first that has a grasp is preferred.
         vacuum: Pressure difference as a fraction of the atmospheric pressure.
         friction: Friction coefficient of the lip on cardboard, tin and plastic.
         unevenness: Largest deviation of the surface under the lip from a plane at which the lip
@@ -73,51 +79,60 @@ class SuctionGripper(StrictModel):
     """
 
     kind: Literal["suction"] = "suction"
-    cup_diameter: Annotated[float, InRange(0.005, 0.1)] = 0.025
-    cup_length: Annotated[float, InRange(0.005, 0.1)] = 0.020
-    extension: Annotated[float, InRange(0.01, 0.5)] = 0.100
-    stroke: Annotated[float, InRange(0.001, 0.05)] = 0.006
-    stiffness: Annotated[float, InRange(100.0, 1e5)] = 2_000.0
+    cups: Annotated[tuple[SuctionCup, ...], Field(min_length=1)]
     vacuum: Annotated[float, InRange(0.01, 1.0)] = 0.8
     friction: Annotated[float, InRange(0.01, 10.0)] = 0.5
     unevenness: Annotated[float, InRange(0.0, 0.01)] = 0.001
     safety: Annotated[float, InRange(1.0, 100.0)] = 1.5
 
-    @property
-    def holding_force(self) -> float:
-        """Force of the atmosphere on the cup [N]."""
-        return self.vacuum * ATMOSPHERIC_PRESSURE * math.pi * self.cup_diameter**2 / 4
+    @model_validator(mode="before")
+    @classmethod
+    def _take_single_cup(cls, document: Any) -> Any:
+        """Accept the fields of the single cup of earlier files in place of `cups`."""
+        return _with_cups(document) if isinstance(document, dict) else document
+
+    @field_validator("cups")
+    @classmethod
+    def _check_names(cls, cups: tuple[SuctionCup, ...]) -> tuple[SuctionCup, ...]:
+        names = [cup.name for cup in cups]
+        if twice := [name for k, name in enumerate(names) if name in names[:k]]:
+            raise rejected_error(f"{twice[0]}: a cup's name; expected names that differ")
+        return cups
 
     @property
-    def length(self) -> float:
-        """Distance from the flange to the lip [m]."""
-        return EPICK_LENGTH + self.extension + self.cup_length
+    def description(self) -> str:
+        """Kind and diameters of the cups."""
+        diameters = ", ".join(f"{1000 * cup.diameter:g} mm" for cup in self.cups)
+        return f"suction, {diameters}"
 
     @property
     def mass(self) -> float:
-        """Mass of the body, which counts towards the payload of the robot [kg]."""
-        return EPICK_MASS
+        """Mass of body, tubes and cups, which counts towards the payload of the robot [kg]."""
+        return epick_mass(self.cups)
 
     @property
-    def X_FG(self) -> RigidTransform:
-        """Pose of G in the flange without load."""
-        return RigidTransform([0.0, 0.0, self.length])
+    def tools(self) -> Mapping[str, Tool]:
+        """Cups by name."""
+        return {
+            cup.name: Tool(cup.name, cup.link, cup.X_FG.transform, (cup.link,), k)
+            for k, cup in enumerate(self.cups)
+        }
 
-    @property
-    def contact_links(self) -> tuple[str, ...]:
-        """Link of the cup."""
-        return ("cup",)
+    def cup(self, name: str) -> SuctionCup:
+        """Return the cup with a name."""
+        return next(cup for cup in self.cups if cup.name == name)
+
+    def holding_force(self, tool: str) -> float:
+        """Return the force of the atmosphere on a cup [N].
+
+        Args:
+            tool: Name of the cup.
+        """
+        return self.vacuum * ATMOSPHERIC_PRESSURE * math.pi * self.cup(tool).diameter ** 2 / 4
 
     def model_sdf(self, *, compliant: bool) -> str:
         """Return the SDF model, see `epick_sdf`."""
-        return epick_sdf(
-            extension=self.extension,
-            cup_diameter=self.cup_diameter,
-            cup_length=self.cup_length,
-            stroke=self.stroke,
-            stiffness=self.stiffness,
-            compliant=compliant,
-        )
+        return epick_sdf(self.cups, compliant=compliant)
 
     def sample_grasps(
         self,
@@ -125,22 +140,47 @@ class SuctionGripper(StrictModel):
         X_TO: RigidTransform,
         sampling: GraspSampling,
     ) -> tuple[Grasp, ...] | GraspFailure:
-        """Return grasps on the top at which the lip seals and holds, see `Gripper`."""
+        """Return grasps on the top at which a lip seals and holds, see `Gripper`.
+
+        Those of the first cup come first, and those of a cup in the order of their distances from
+        the center of mass.
+        """
+        grasps = list[Grasp]()
+        closest_mismatch: _Mismatch | None = (True, math.inf)
+        for cup in self.cups:
+            of_cup, mismatch = self._sample_grasps_of(cup, object_class, X_TO, sampling)
+            grasps += of_cup
+            if closest_mismatch is not None and mismatch is not None:
+                mismatch = min(mismatch, closest_mismatch)
+            closest_mismatch = mismatch
+        if grasps:
+            return tuple(grasps)
+        if closest_mismatch is not None:
+            return GraspFailure(GraspFailureReason.NO_SEAL, closest_mismatch[1])
+        return GraspFailure(GraspFailureReason.TOO_HEAVY, object_class.mass)
+
+    def _sample_grasps_of(
+        self,
+        cup: SuctionCup,
+        object_class: ObjectClass,
+        X_TO: RigidTransform,
+        sampling: GraspSampling,
+    ) -> tuple[list[Grasp], _Mismatch | None]:
+        """Return the grasps of a cup, and the closest mismatch; None if the cup seals somewhere."""
         corners_T = object_class.corners @ np.ascontiguousarray(X_TO.rotation().matrix()).T
         corners_T = corners_T + X_TO.translation()
         lower, upper = corners_T.min(axis=0), corners_T.max(axis=0)
         grasps = list[Grasp]()
         p_TCm = X_TO @ object_class.center_of_mass
-        # Of the profiles that do not seal: whether they are uneven, and deviation or gap.
-        closest_mismatch = (True, math.inf)
+        closest_mismatch: _Mismatch = (True, math.inf)
         has_seal = False
         for x, y in _grid_points(lower[:2], upper[:2], p_TCm[:2], sampling.spacing):
             X_TG = RigidTransform(_DOWNWARD_ROTATION, [x, y, upper[2]])
             X_OG = X_TO.InvertAndCompose(X_TG)
-            profile = lip_surface_profile(object_class, X_OG, self.cup_diameter)
+            profile = lip_surface_profile(object_class, X_OG, cup.diameter)
             if object_class.shape is Shape.MESH and np.isfinite(profile).all():
                 # The lip goes down until it touches a convex piece, which may bulge.
-                contact_depth = _contact_depth(object_class, X_OG, self.cup_diameter)
+                contact_depth = _contact_depth(object_class, X_OG, cup.diameter)
                 X_TG = RigidTransform(_DOWNWARD_ROTATION, [x, y, upper[2] - contact_depth])
                 profile = profile - contact_depth
             profile = profile + sampling.lip_gap
@@ -152,39 +192,44 @@ class SuctionGripper(StrictModel):
                 continue
             has_seal = True
             p_GCm = X_TG.rotation().inverse() @ (p_TCm - X_TG.translation())
-            acceleration = self.max_acceleration(object_class.mass, p_GCm)
+            acceleration = self.max_acceleration(cup.name, object_class.mass, p_GCm)
             if acceleration >= sampling.min_payload_acceleration:
                 # The horizontal offset of the load depends on the yaw, and is neglected.
                 p_GCm = (0.0, 0.0, round(float(p_GCm[2]), 2))
-                payload = Payload(object_class.mass, p_GCm, round(acceleration, 1))
-                grasps.append(Grasp(X_TG.translation(), payload))
+                a, b, c = (cup.X_FG.transform @ np.array(p_GCm)).tolist()
+                payload = Payload(object_class.mass, (a, b, c), round(acceleration, 1))
+                grasps.append(Grasp(cup.name, X_TG, payload))
                 if len(grasps) == sampling.max_grasps:
                     break
-        if grasps:
-            return tuple(grasps)
-        if not has_seal:
-            return GraspFailure(GraspFailureReason.NO_SEAL, closest_mismatch[1])
-        return GraspFailure(GraspFailureReason.TOO_HEAVY, object_class.mass)
+        return grasps, None if has_seal else closest_mismatch
 
-    def can_attach(self, object_class: ObjectClass, X_OG: RigidTransform) -> bool:
+    def can_attach(self, tool: str, object_class: ObjectClass, X_OG: RigidTransform) -> bool:
         """Return whether the lip seals on the surface at a pose, see `Gripper`."""
-        return self._seals(lip_surface_profile(object_class, X_OG, self.cup_diameter))
+        return self._seals(lip_surface_profile(object_class, X_OG, self.cup(tool).diameter))
 
     def _seals(self, profile: Floats) -> bool:
         """Return whether the lip seals at distances to the surface, see `lip_surface_profile`."""
         return bool(_deviation(profile) <= self.unevenness and profile.min() <= MAX_SEAL_GAP)
 
-    def max_acceleration(self, mass: float, p_GCm: Floats) -> float:
-        """Return the largest acceleration of a cup that points down, see `Gripper`.
+    def max_acceleration(self, tool: str, mass: float, p_GCm: Floats) -> float:
+        """Return the largest acceleration of a load in any direction on a cup that points down.
 
-        The resolution of the result is 0.01 m/s^2, and its largest value 50 m/s^2.
+        Args:
+            tool: Name of the cup.
+            mass: Mass of the load [kg].
+            p_GCm: Center of mass of the load [m]. Shape (3,).
+
+        Returns:
+            Acceleration including the safety factor, at most 50 and in steps of 0.01 [m/s^2];
+            negative if the load cannot be held.
         """
 
         def is_feasible(accelerations: Floats) -> NDArray[np.bool_]:
             force, moment = payload_wrench(
                 mass, p_GCm, accelerations[:, None, None] * _ACCELERATION_DIRECTIONS
             )
-            return np.asarray(self.load_ratio(force, moment).max(axis=1) * self.safety <= 1)
+            ratios = self.load_ratio(tool, force, moment)
+            return np.asarray(ratios.max(axis=1) * self.safety <= 1)
 
         low, high = 0.0, 50.0
         while high - low > 0.01:
@@ -196,15 +241,56 @@ class SuctionGripper(StrictModel):
             high = float(candidates[min(largest + 1, 8)])
         return low
 
-    def load_ratio(self, force: Floats, moment: Floats) -> Floats:
-        """Return the larger of the load ratios of opening and of sliding, see `Gripper`."""
-        radius = self.cup_diameter / 2
+    def load_ratio(self, tool: str, force: Floats, moment: Floats) -> Floats:
+        """Return the ratio of a load to the load capacity of a cup; it detaches above 1.
+
+        Args:
+            tool: Name of the cup.
+            force: Force of the object on the cup, in G [N]. Shape (..., 3).
+            moment: Moment of the object about G, in G [N m]. Shape (..., 3).
+
+        Returns:
+            The larger of the ratios of opening and of sliding. Shape (...).
+        """
+        radius = self.cup(tool).diameter / 2
+        holding_force = self.holding_force(tool)
         bending = np.hypot(moment[..., 0], moment[..., 1])
-        opening = np.maximum(force[..., 2] + 2 * bending / radius, 0.0) / self.holding_force
-        normal_force = np.maximum(self.holding_force - force[..., 2], 1e-9)
+        opening = np.maximum(force[..., 2] + 2 * bending / radius, 0.0) / holding_force
+        normal_force = np.maximum(holding_force - force[..., 2], 1e-9)
         # A torsional moment acts as tangential force at the radius of the lip, a thin ring.
         tangential = np.hypot(np.hypot(force[..., 0], force[..., 1]), moment[..., 2] / radius)
         return np.asarray(np.maximum(opening, tangential / (self.friction * normal_force)))
+
+
+_CUP_FIELDS = {
+    "cup_diameter": "diameter",
+    "cup_length": "length",
+    "extension": "extension",
+    "stroke": "stroke",
+    "stiffness": "stiffness",
+}
+"""Fields of a cup by those of the gripper's only cup in earlier files."""
+
+
+def _with_cups(document: dict[str, Any]) -> dict[str, Any]:
+    """Return a document of a gripper with the fields of an only cup as `cups`.
+
+    They change the cup of a gripper that has one, and replace the cups of any other.
+    """
+    given = {_CUP_FIELDS[key]: value for key, value in document.items() if key in _CUP_FIELDS}
+    if not given and "cups" in document:
+        return document
+    rest = {key: value for key, value in document.items() if key not in _CUP_FIELDS}
+    cups = rest.get("cups")
+    is_only = isinstance(cups, tuple) and len(cups) == 1 and isinstance(cups[0], SuctionCup)
+    cup: dict[str, Any] = {"name": "single", "extension": 0.100, "length": 0.020}
+    cup |= {**(dict(cups[0]) if is_only and cups else {}), **given}
+    if "X_FG" not in cup or given.keys() & {"extension", "length"}:
+        extension, length = cup["extension"], cup["length"]
+        is_valid = isinstance(extension, int | float) and isinstance(length, int | float)
+        z = EPICK_LENGTH + extension + length if is_valid else 0.0
+        cup["X_FG"] = {"translation": [0.0, 0.0, z]}
+    return {**rest, "cups": [cup]}
 
 
 def _grid_points(lower: Floats, upper: Floats, target: Floats, spacing: float) -> Floats:

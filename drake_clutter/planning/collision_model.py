@@ -1,6 +1,6 @@
 """Signed distances between arm, attached object and obstacles, with gradients.
 
-Frames: T is the support and the world, F is the flange, G is the gripper, O is an object.
+Frames: T is the support and the world, F is the flange, G is a tool of the gripper, O is an object.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -17,7 +17,7 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import CoulombFriction
-from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable, RigidBody
+from pydrake.multibody.tree import BodyIndex, Frame, JacobianWrtVariable, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_clutter.catalog import ObjectClass
@@ -111,7 +111,7 @@ class CollisionModel:
         self._filters.Apply(CollisionFilterDeclaration().ExcludeWithin(obstacles))
         self.arm_names = frozenset(body.name() for body in self._arm.bodies)
         self.fixture_tops = self._highest_points({fixture.name for fixture in cell.fixtures})
-        self._attached: tuple[str, Floats] | None = None
+        self._attached: tuple[str, Frame, Floats] | None = None
         self._attachment_filters: list[object] = []
 
     def _geometries(self, *bodies: RigidBody) -> GeometrySet:
@@ -180,21 +180,22 @@ class CollisionModel:
         self.plant.SetFreeBodyPose(self._context, self._bodies[name], rigid_transform(X_TO))
         self._q = self.plant.GetPositions(self._context)
 
-    def attach_object(self, name: str, X_OG: RigidTransform) -> None:
-        """Attach an object to the gripper.
+    def attach_object(self, name: str, tool: str, X_OG: RigidTransform) -> None:
+        """Attach an object to a tool of the gripper.
 
         Distances between the object and obstacles are reported, distances between the object and
         the gripper are not.
 
         Args:
             name: Name of the object.
-            X_OG: Pose of the gripper in the object.
+            tool: Name of the tool.
+            X_OG: Pose of the tool in the object.
         """
         self.detach_object()
         attached = self._geometries(self._bodies[name])
         others = self._geometries(*self._fixed, *(b for n, b in self._bodies.items() if n != name))
         gripper = self._geometries(
-            *(body for body in self._arm.bodies if body.model_instance() == self._arm.tool)
+            *(body for body in self._arm.bodies if body.model_instance() == self._arm.gripper)
         )
         declaration = (
             CollisionFilterDeclaration()
@@ -202,7 +203,7 @@ class CollisionModel:
             .AllowBetween(attached, others)
         )
         self._attachment_filters.append(self._filters.ApplyTransient(declaration))
-        self._attached = name, invert_pose(X_OG.GetAsMatrix4())
+        self._attached = name, self._arm.tools[tool], invert_pose(X_OG.GetAsMatrix4())
 
     def detach_object(self) -> None:
         """Detach the attached object, if any; it stays at its last pose."""
@@ -214,8 +215,8 @@ class CollisionModel:
         self._q[self._q_indices] = q
         self.plant.SetPositions(self._context, self._q)
         if self._attached is not None:
-            name, X_GO = self._attached
-            X_TG = self._arm.cup.CalcPoseInWorld(self._context).GetAsMatrix4()
+            name, frame, X_GO = self._attached
+            X_TG = frame.CalcPoseInWorld(self._context).GetAsMatrix4()
             self.plant.SetFreeBodyPose(
                 self._context, self._bodies[name], RigidTransform(X_TG @ X_GO)
             )
@@ -278,21 +279,27 @@ class CollisionModel:
             distances.append((self._to_signed_distance(pair), gradient))
         return distances
 
-    def gripper_position(self) -> Floats:
-        """Return p_TG at the joint positions of the last distance query [m]. Shape (3,)."""
-        return np.asarray(self._arm.cup.CalcPoseInWorld(self._context).translation())
+    def tool_position(self, tool: str) -> Floats:
+        """Return p_TG of a tool at the positions of the last distance query [m]. Shape (3,)."""
+        return np.asarray(self._arm.tools[tool].CalcPoseInWorld(self._context).translation())
 
-    def gripper_jacobian(self, q: Floats) -> Floats:
+    def tool_jacobian(self, tool: str, q: Floats) -> Floats:
         """Return the spatial Jacobian of G in T, angular rows first. Shape (6, n).
 
         Args:
+            tool: Name of the tool.
             q: Joint positions of the arm. Shape (n,).
         """
         self._q[self._q_indices] = q
         self.plant.SetPositions(self._context, self._q)
         world = self.plant.world_frame()
         J = self.plant.CalcJacobianSpatialVelocity(
-            self._context, JacobianWrtVariable.kV, self._arm.cup, np.zeros(3), world, world
+            self._context,
+            JacobianWrtVariable.kV,
+            self._arm.tools[tool],
+            np.zeros(3),
+            world,
+            world,
         )
         return np.asarray(J[:, self._v_indices])
 

@@ -1,6 +1,6 @@
 """Results of the pick-and-place planner: a plan, or the reason why there is none.
 
-Frames: T is the support, G is the gripper, O is the picked object.
+Frames: T is the support, G is the tool that holds the picked object, O is that object.
 
 A plan has three trajectory segments that start and end at rest: `approach` from the home
 configuration to the grasp, `carry` to the place pose, and `retreat` to the home configuration. A
@@ -16,6 +16,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.trajectories import Trajectory
 
+from drake_clutter.cell.gripper import Payload
 from drake_clutter.planning.collision_model import SignedDistance
 from drake_clutter.scenes.scene import Pose
 
@@ -121,9 +122,9 @@ class PickPlacePlan:
         pick: Name of the object.
         X_TO_pick: Pose of the object before the move.
         X_TO_place: Pose at which the object is released, without guarded descent.
-        X_OG: Grasp: pose of the gripper in the object.
-        mass: Mass of the object [kg].
-        p_GCm: Center of mass of the object in the gripper frame [m]. Shape (3,).
+        tool: Name of the tool that holds the object.
+        X_OG: Grasp: pose of the tool in the object.
+        payload: Load while the object is held.
         segments: `approach`, `carry` and `retreat`.
         num_attempts: Number of combinations of grasp, inverse kinematics solution and transfer
             height that were tried.
@@ -136,9 +137,9 @@ class PickPlacePlan:
     pick: str
     X_TO_pick: Pose
     X_TO_place: Pose
+    tool: str
     X_OG: RigidTransform
-    mass: float
-    p_GCm: tuple[float, float, float]
+    payload: Payload
     segments: tuple[TrajectorySegment, ...]
     num_attempts: int
     planning_time: float
@@ -186,6 +187,7 @@ def plan_to_dict(plan: PickPlacePlan | PlanningFailure) -> dict[str, Any]:
     return {
         "planned": True,
         "place": {"translation": list(pose.translation), "quaternion": list(pose.quaternion)},
+        "tool": plan.tool,
         "X_OG": plan.X_OG.GetAsMatrix4().tolist(),
         "duration": plan.duration,
         "max_descent": plan.max_descent,

@@ -1,6 +1,6 @@
 """Pick-and-place planner: grasps, collision-free paths, time-optimal trajectories.
 
-Frames: T is the support, G is the gripper, O is the picked object.
+Frames: T is the support, G is a tool of the gripper, O is the picked object.
 """
 
 import time
@@ -19,6 +19,7 @@ from drake_clutter.planning.pick_place_plan import (
 from drake_clutter.planning.pick_place_search import PickPlaceSearch
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics
+from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.geometry import objects_resting_on
 from drake_clutter.scenes.occlusion import OccludedBox
 from drake_clutter.scenes.scene import Pose, SceneObject
@@ -31,7 +32,8 @@ class PickPlacePlanner:
     Attributes:
         cell: Work cell.
         config: Parameters of the planner.
-        tool: Kinematics of robot and gripper.
+        robot: Robot of the cell.
+        tools: Kinematics of robot and tool, by name of the tool.
     """
 
     def __init__(self, cell: WorkCell, config: PlannerConfig) -> None:
@@ -46,7 +48,8 @@ class PickPlacePlanner:
         """
         self.cell = cell
         self.config = config
-        self.tool = ToolKinematics(cell)
+        self.robot = load_robot(cell.robot)
+        self.tools = {name: ToolKinematics(cell, name) for name in cell.gripper.tools}
         self._gripper: Gripper = cell.gripper
         self._collision_models: dict[Hashable, CollisionModel] = {}
         self._grasps = lru_cache(maxsize=256)(self._find_grasps)
@@ -112,7 +115,7 @@ class PickPlacePlanner:
         if self.cell.pedestal_overlaps_support:
             return PlanningFailure(PlanningFailureReason.IN_COLLISION, "pedestal and tray")
         model = self.collision_model(objects, occluded)
-        if pairs := model.distances_below(self.tool.robot.home, self.config.min_distance):
+        if pairs := model.distances_below(self.robot.home, self.config.min_distance):
             nearest = min(pairs, key=lambda pair: pair.distance)
             return PlanningFailure(
                 PlanningFailureReason.IN_COLLISION,
@@ -120,9 +123,9 @@ class PickPlacePlanner:
                 nearest.distance,
             )
         tops = [*model.fixture_tops, *(box.top_height for box in occluded)]
-        search = PickPlaceSearch(self.cell, self.config, model, objects, picked, X_TO_place, tops)
+        search = self._search(model, objects, picked, X_TO_place, tops)
         for grasp in grasps:
-            for q_pick, q_place, yaw in search.ik_candidates(grasp):
+            for candidate in search.ik_candidates(grasp):
                 if search.num_attempts >= self.config.max_attempts:
                     return search.failures.furthest
                 if time.perf_counter() - start_time > self.config.time_limit:
@@ -131,10 +134,22 @@ class PickPlacePlanner:
                         str(search.failures.furthest),
                         self.config.time_limit,
                     )
-                plan = search.plan_grasp(grasp, q_pick, q_place, yaw)
+                plan = search.plan_candidate(candidate)
                 if plan is not None:
                     return plan
         return search.failures.furthest
+
+    def _search(
+        self,
+        model: CollisionModel,
+        objects: Sequence[SceneObject],
+        picked: SceneObject,
+        X_TO_place: Pose,
+        obstacle_tops: Sequence[float] = (),
+    ) -> PickPlaceSearch:
+        return PickPlaceSearch(
+            self.cell, self.config, self.tools, model, objects, picked, X_TO_place, obstacle_tops
+        )
 
     def can_grasp(self, scene_object: SceneObject) -> bool:
         """Return whether the gripper has a grasp on an object that holds its weight."""
@@ -186,5 +201,5 @@ class PickPlacePlanner:
         if objects_resting_on(picked, objects) or isinstance(grasps, PlanningFailure):
             return False
         model = self.collision_model(objects)
-        search = PickPlaceSearch(self.cell, self.config, model, objects, picked, X_TO_place)
+        search = self._search(model, objects, picked, X_TO_place)
         return any(search.has_candidate(grasp) for grasp in grasps)

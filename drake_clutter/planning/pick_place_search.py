@@ -1,10 +1,10 @@
 """Search for a plan over grasps, yaw angles, IK solutions and transfer heights.
 
-Frames: T is the support, G is the gripper, O is the picked object.
+Frames: T is the support, G is a tool of the gripper, O is the picked object.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,15 +25,17 @@ from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.segment_planner import (
     CONTACT_TOLERANCE,
     EndpointContext,
+    GraspCandidate,
     SegmentPlanner,
 )
 from drake_clutter.planning.time_parameterization import min_travel_time
 from drake_clutter.planning.tool_kinematics import (
     ToolKinematics,
-    downward_pose,
     invert_pose,
-    raise_pose,
+    retreat_along_axis,
+    turn_about_axis,
 )
+from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.scene_plant import rigid_transform
 
@@ -56,6 +58,7 @@ class PickPlaceSearch:
         self,
         cell: WorkCell,
         config: PlannerConfig,
+        tools: Mapping[str, ToolKinematics],
         collision_model: CollisionModel,
         objects: Sequence[SceneObject],
         picked: SceneObject,
@@ -67,6 +70,7 @@ class PickPlaceSearch:
         Args:
             cell: Work cell.
             config: Parameters of the planner.
+            tools: Kinematics of robot and tool, by name of the tool.
             collision_model: Collision model with the objects at their poses.
             objects: All known objects, including the picked one.
             picked: Object to pick.
@@ -76,15 +80,15 @@ class PickPlaceSearch:
         self._cell = cell
         self._config = config
         self._picked = picked
-        self._tool = ToolKinematics(cell)
-        self._robot = self._tool.robot
+        self._tools = tools
+        self._robot = load_robot(cell.robot)
         self._X_TO_goal = X_TO_place
         self._X_TO = _to_matrix(rigid_transform(picked.X_TO))
         self._X_TO_place = _to_matrix(rigid_transform(X_TO_place))
         self.num_attempts = 0
         self.failures = FailureLog()
         self._segments = SegmentPlanner(
-            cell, config, collision_model, picked, X_TO_place, self.failures
+            cell, config, tools, collision_model, picked, X_TO_place, self.failures
         )
         placed = replace(picked, X_TO=X_TO_place)
         self._others = [o for o in objects if o is not picked]
@@ -96,19 +100,19 @@ class PickPlaceSearch:
         self._transfer_heights = [bottom + lift_height]
         self._transfer_heights += [top + lift_height for top in tops if top > bottom]
 
-    def ik_candidates(self, grasp: Grasp) -> list[tuple[Floats, Floats, float]]:
-        """Return pairs of inverse kinematics solutions at the grasp and at the place pose.
+    def ik_candidates(self, grasp: Grasp) -> list[GraspCandidate]:
+        """Return the combinations of yaw and inverse kinematics solutions of a grasp.
 
         Returns:
-            Joint positions at the grasp, shape (n,), joint positions at the place pose, shape (n,),
-            and yaw of the gripper [rad]; the candidate with the shortest travel time first.
+            Candidates; the one with the shortest travel time first.
         """
         home = self._robot.home
+        tool = self._tools[grasp.tool]
         yaws = np.arange(self._config.num_yaws) * (2 * math.pi / self._config.num_yaws)
-        X_pick = [raise_pose(downward_pose(yaw, grasp.p_TG), self._config.lip_gap) for yaw in yaws]
+        X_pick = [self._gripper_pose_at_pick(grasp, yaw) for yaw in yaws]
         X_place = [self._gripper_pose_at_place(X) for X in X_pick]
-        q_pick = self._tool.solve_ik(np.array(X_pick))
-        q_place = self._tool.solve_ik(np.array(X_place))
+        q_pick = tool.solve_ik(np.array(X_pick))
+        q_place = tool.solve_ik(np.array(X_place))
         q_place = self._robot.ik.match(q_pick, q_place)
         is_pick_reachable = np.isfinite(q_pick[..., 0])
         if (is_pick_reachable & ~np.isfinite(q_place[..., 0])).any():
@@ -122,36 +126,48 @@ class PickPlaceSearch:
         num_candidates = np.isfinite(travel_time).sum()
         num_solutions = self._robot.ik.num_solutions
         indices = [divmod(int(k), num_solutions) for k in order[:num_candidates]]
-        return [(q_pick[k], q_place[k], float(yaws[k[0]])) for k in indices]
+        return [
+            GraspCandidate(
+                tool=grasp.tool,
+                payload=grasp.payload,
+                X_TG_pick=X_pick[k[0]],
+                X_TG_place=X_place[k[0]],
+                X_OG=RigidTransform(invert_pose(self._X_TO) @ X_pick[k[0]]),
+                q_pick=q_pick[k],
+                q_place=q_place[k],
+            )
+            for k in indices
+        ]
+
+    def _gripper_pose_at_pick(self, grasp: Grasp, yaw: float) -> Floats:
+        """Return X_TG at the grasp, `PlannerConfig.lip_gap` above the surface. Shape (4, 4)."""
+        X_TG = turn_about_axis(_to_matrix(grasp.X_TG), yaw)
+        return retreat_along_axis(X_TG, self._config.lip_gap)
 
     def _gripper_pose_at_place(self, X_TG: Floats) -> Floats:
         """Return X_TG at the place pose for X_TG at the grasp. Shapes (4, 4)."""
         return np.asarray(self._X_TO_place @ invert_pose(self._X_TO) @ X_TG)
 
-    def _grasp_poses(self, grasp: Grasp, yaw: float) -> tuple[Floats, Floats, RigidTransform]:
-        """Return X_TG at the grasp and at the place pose, shapes (4, 4), and X_OG."""
-        X_pick = raise_pose(downward_pose(yaw, grasp.p_TG), self._config.lip_gap)
-        X_place = self._gripper_pose_at_place(X_pick)
-        return X_pick, X_place, RigidTransform(invert_pose(self._X_TO) @ X_pick)
-
-    def _pick_endpoint(self, X_OG: RigidTransform, q: Floats) -> EndpointContext | None:
+    def _pick_endpoint(self, candidate: GraspCandidate) -> EndpointContext | None:
         """Return the endpoint at the pick pose, or None if the arm is in collision there."""
-        self._segments.set_up_segment("approach", X_OG)
-        p_TG_xy = (self._X_TO @ _to_matrix(X_OG))[:2, 3]
-        of_gripper = self._segments.distances_below_object(q, self._bodies_below(self._picked))
-        context = EndpointContext(p_TG_xy, of_gripper)
+        q = candidate.q_pick
+        self._segments.set_up_segment("approach", candidate)
+        below = self._bodies_below(self._picked)
+        of_gripper = self._segments.distances_below_object(candidate, q, below)
+        context = EndpointContext(candidate.tool, candidate.X_TG_pick[:2, 3], of_gripper)
         if self._segments.min_distance_along(q[None], context, 1, "at the grasp") is None:
             return None
-        self._segments.set_up_segment("carry", X_OG)
-        return EndpointContext(p_TG_xy, of_gripper | self._segments.contact_distances(q))
+        self._segments.set_up_segment("carry", candidate)
+        of_object = self._segments.contact_distances(q)
+        return replace(context, allowed_distances=of_gripper | of_object)
 
-    def _place_endpoint(self, X_OG: RigidTransform, q: Floats) -> EndpointContext | None:
+    def _place_endpoint(self, candidate: GraspCandidate, q: Floats) -> EndpointContext | None:
         """Return the endpoint at the place pose, or None in collision."""
-        self._segments.set_up_segment("carry", X_OG)
-        p_TG_xy = (self._X_TO_place @ _to_matrix(X_OG))[:2, 3]
+        self._segments.set_up_segment("carry", candidate)
         below = self._bodies_below(replace(self._picked, X_TO=self._X_TO_goal))
-        of_gripper = self._segments.distances_below_object(q, below)
-        context = EndpointContext(p_TG_xy, of_gripper | self._segments.contact_distances(q))
+        of_gripper = self._segments.distances_below_object(candidate, q, below)
+        allowed = of_gripper | self._segments.contact_distances(q)
+        context = EndpointContext(candidate.tool, candidate.X_TG_place[:2, 3], allowed)
         distance = self._segments.min_distance_along(q[None], context, 2, "at the place")
         return None if distance is None else context
 
@@ -162,70 +178,73 @@ class PickPlaceSearch:
 
     def has_candidate(self, grasp: Grasp) -> bool:
         """Return whether a grasp reaches both endpoints without collision."""
-        for q_pick, q_place, yaw in self.ik_candidates(grasp):
-            X_OG = self._grasp_poses(grasp, yaw)[2]
-            if self._pick_endpoint(X_OG, q_pick) and self._place_endpoint(X_OG, q_place):
-                return True
-        return False
+        return any(
+            self._pick_endpoint(candidate) and self._place_endpoint(candidate, candidate.q_place)
+            for candidate in self.ik_candidates(grasp)
+        )
 
-    def plan_grasp(
-        self, grasp: Grasp, q_pick: Floats, q_place: Floats, yaw: float
-    ) -> PickPlacePlan | None:
+    def plan_candidate(self, candidate: GraspCandidate) -> PickPlacePlan | None:
         """Return a plan with one of the `ik_candidates` at the lowest feasible height.
 
         Args:
-            grasp: Grasp of the object.
-            q_pick: Joint positions at the grasp. Shape (n,).
-            q_place: Joint positions at the place pose. Shape (n,).
-            yaw: Yaw of the gripper [rad].
+            candidate: Grasp of the object.
 
         Returns:
             The plan, or None after recording a failure.
         """
         self.num_attempts += 1
-        X_pick, X_place, X_OG = self._grasp_poses(grasp, yaw)
-        pick = self._pick_endpoint(X_OG, q_pick)
+        pick = self._pick_endpoint(candidate)
         if pick is None:
             return None
         # Without linear rows the configuration at the place pose results from the path.
         place = None
         ends_at_q_place = self._robot.vertical_tool_rows is not None
-        if ends_at_q_place and (place := self._place_endpoint(X_OG, q_place)) is None:
-            return None
-        gripper_height = X_pick[2, 3] - self._picked.bounds_T[0][2]
+        if ends_at_q_place:
+            place = self._place_endpoint(candidate, candidate.q_place)
+            if place is None:
+                return None
+        gripper_height = candidate.X_TG_pick[2, 3] - self._picked.bounds_T[0][2]
         for bottom in self._transfer_heights:
             self.num_attempts += 1
             height = bottom + gripper_height
-            carry_path = self._tool.carry_path(X_pick, X_place, height, q_pick, q_place)
+            carry_path = self._tools[candidate.tool].carry_path(
+                candidate.X_TG_pick,
+                candidate.X_TG_place,
+                height,
+                candidate.q_pick,
+                candidate.q_place,
+            )
             if isinstance(carry_path, str):
                 self.failures.record(3, PlanningFailureReason.UNREACHABLE, carry_path, height)
                 return None
             q_end = carry_path.reversed_lowering[0]
-            if not ends_at_q_place and (place := self._place_endpoint(X_OG, q_end)) is None:
+            if not ends_at_q_place and (place := self._place_endpoint(candidate, q_end)) is None:
                 continue
             assert place is not None
-            segments = self._segments.plan_segments(grasp, X_OG, carry_path, (pick, place))
+            segments = self._segments.plan_segments(candidate, carry_path, (pick, place))
             if segments is not None:
-                return self._make_plan(X_OG, segments, place, q_end)
+                return self._make_plan(candidate, segments, place, q_end)
         return None
 
     def _make_plan(
         self,
-        X_OG: RigidTransform,
+        candidate: GraspCandidate,
         segments: tuple[TrajectorySegment, ...],
         place: EndpointContext,
         q_place: Floats,
     ) -> PickPlacePlan:
-        x, y, z = X_OG.inverse() @ self._picked.object_class.center_of_mass
+        X_FG = self._cell.gripper.tools[candidate.tool].X_FG
+        p_GCm = candidate.X_OG.inverse() @ self._picked.object_class.center_of_mass
+        x, y, z = (X_FG @ p_GCm).tolist()
         return PickPlacePlan(
             pick=self._picked.name,
             X_TO_pick=self._picked.X_TO,
             X_TO_place=self._X_TO_goal,
-            X_OG=X_OG,
-            mass=self._picked.object_class.mass,
-            p_GCm=(float(x), float(y), float(z)),
+            tool=candidate.tool,
+            X_OG=candidate.X_OG,
+            payload=replace(candidate.payload, p_FCm=(x, y, z)),
             segments=segments,
             num_attempts=self.num_attempts,
             planning_time=0.0,
-            guarded_descent=self._segments.plan_guarded_descent(X_OG, place, q_place),
+            guarded_descent=self._segments.plan_guarded_descent(candidate, place, q_place),
         )

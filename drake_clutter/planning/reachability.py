@@ -1,6 +1,7 @@
 """Reachability maps of the arm in its empty cell.
 
-Frames: T is the support, G is the gripper. The cell has all its fixtures, and no objects.
+Frames: T is the support, G is the first tool of the gripper. The cell has all its fixtures, and no
+objects.
 """
 
 from collections.abc import Sequence
@@ -57,6 +58,7 @@ class ReachabilityAnalysis:
         """
         self._cell = cell
         self._planner = PickPlacePlanner(cell, PlannerConfig())
+        self._tool = next(iter(self._planner.tools.values()))
         self._collision_model = self._planner.collision_model(())
         self._min_distance = self._planner.config.min_distance
 
@@ -64,10 +66,10 @@ class ReachabilityAnalysis:
         """Return the reachability of poses.
 
         Args:
-            X_TG: Poses of the gripper. Shape (m, 4, 4).
+            X_TG: Poses of the first tool. Shape (m, 4, 4).
         """
-        robot = self._planner.tool.robot
-        q = self._planner.tool.solve_ik(X_TG)
+        robot = self._planner.robot
+        q = self._tool.solve_ik(X_TG)
         manipulability = np.nan_to_num(robot.manipulability(q), nan=-1.0)
         num_solutions = np.zeros(len(q), int)
         best_manipulability = np.zeros(len(q))

@@ -1,11 +1,12 @@
 """Collision-free, timed trajectory segments of a move: approach, carry, retreat, descent.
 
-Frames: T is the support, G is the gripper, O is the picked object.
+Frames: T is the support, G is a tool of the gripper, O is the picked object.
 """
 
 import math
 from collections.abc import Mapping, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
-from drake_clutter.cell.gripper import Grasp, Payload
+from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.collision_model import CollisionModel, SignedDistance
 from drake_clutter.planning.pick_place_plan import (
@@ -36,8 +37,8 @@ from drake_clutter.planning.trajectory_optimization import (
     TrajectoryOptimizationProblem,
     optimize_trajectory,
 )
+from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.scene import Pose, SceneObject
-from drake_clutter.simulation.scene_plant import rigid_transform
 
 Floats = NDArray[np.float64]
 
@@ -59,16 +60,41 @@ _DESCENT_STEP = 0.005
 
 
 @dataclass(frozen=True)
+class GraspCandidate:
+    """Grasp at one yaw, with an inverse kinematics solution at each endpoint.
+
+    Attributes:
+        tool: Name of the tool.
+        payload: Load after the grasp.
+        X_TG_pick: Pose of the tool at the grasp. Shape (4, 4).
+        X_TG_place: Pose of the tool at the place pose. Shape (4, 4).
+        X_OG: Pose of the tool in the object.
+        q_pick: Joint positions at the grasp [rad]. Shape (n,).
+        q_place: Joint positions at the place pose [rad]. Shape (n,).
+    """
+
+    tool: str
+    payload: Payload
+    X_TG_pick: Floats
+    X_TG_place: Floats
+    X_OG: RigidTransform
+    q_pick: Floats
+    q_place: Floats
+
+
+@dataclass(frozen=True)
 class EndpointContext:
     """Distances that are allowed near the pick or the place pose.
 
     Attributes:
-        p_TG_xy: Horizontal position of the gripper at the endpoint [m]. Shape (2,).
+        tool: Name of the tool that grasps the object.
+        p_TG_xy: Horizontal position of the tool at the endpoint [m]. Shape (2,).
         allowed_distances: Allowed distance of pairs at the endpoint [m]: between the attached
             object and each body that it touches there, and between the gripper and each body below
             a thin object, by names.
     """
 
+    tool: str
     p_TG_xy: Floats
     allowed_distances: Mapping[tuple[str, str], float]
 
@@ -80,6 +106,7 @@ class SegmentPlanner:
         self,
         cell: WorkCell,
         config: PlannerConfig,
+        tools: Mapping[str, ToolKinematics],
         collision_model: CollisionModel,
         picked: SceneObject,
         X_TO_place: Pose,
@@ -90,6 +117,7 @@ class SegmentPlanner:
         Args:
             cell: Work cell.
             config: Parameters of the planner.
+            tools: Kinematics of robot and tool, by name of the tool.
             collision_model: Collision model with the objects at their poses.
             picked: Object to pick.
             X_TO_place: Pose at which the object is released.
@@ -101,9 +129,12 @@ class SegmentPlanner:
         self._picked = picked
         self._X_TO_place = X_TO_place
         self._failures = failures
-        self._tool = ToolKinematics(cell)
-        self._robot = self._tool.robot
-        self._grasp_contacts = [(link, picked.name) for link in cell.gripper.contact_links]
+        self._tools = tools
+        self._robot = load_robot(cell.robot)
+        self._grasp_contacts = {
+            name: [(link, picked.name) for link in tool.contact_links]
+            for name, tool in cell.gripper.tools.items()
+        }
 
     def min_distance_along(
         self, path: Floats, endpoint: EndpointContext, progress: int, stage: str
@@ -154,30 +185,34 @@ class SegmentPlanner:
             endpoint: Endpoint near which smaller distances are allowed.
             min_distance: Required distance of all other pairs [m].
         """
-        if distance.pair in self._grasp_contacts:
+        if distance.pair in self._grasp_contacts[endpoint.tool]:
             allowed = self._config.lip_gap / 2
         elif distance.pair in endpoint.allowed_distances:
             allowed = endpoint.allowed_distances[distance.pair]
         else:
             return min_distance
-        offset = self._collision_model.gripper_position()[:2] - endpoint.p_TG_xy
+        offset = self._collision_model.tool_position(endpoint.tool)[:2] - endpoint.p_TG_xy
         return min(min_distance, allowed + float(np.linalg.norm(offset)))
 
-    def distances_below_object(self, q: Floats, below: Set[str]) -> dict[tuple[str, str], float]:
+    def distances_below_object(
+        self, candidate: GraspCandidate, q: Floats, below: Set[str]
+    ) -> dict[tuple[str, str], float]:
         """Return the allowed distances between gripper and bodies below a thin object [m].
 
         The gripper comes as close to them as the object is thin.
 
         Args:
-            q: Joint positions at which the gripper holds the object. Shape (n,).
+            candidate: Grasp.
+            q: Joint positions at which the tool holds the object. Shape (n,).
             below: Names of the bodies below the object.
         """
+        links = self._cell.gripper.tools[candidate.tool].contact_links
         distances = self._collision_model.distances_below(q, self._config.min_distance)
         # A body may have several geometries: the smallest distance is the last and is kept.
         return {
             distance.pair: max(distance.distance - CONTACT_TOLERANCE, self._config.lip_gap / 2)
             for distance in sorted(distances, key=lambda distance: -distance.distance)
-            if distance.pair[0] in self._cell.gripper.contact_links and distance.pair[1] in below
+            if distance.pair[0] in links and distance.pair[1] in below
         }
 
     def contact_distances(self, q: Floats) -> dict[tuple[str, str], float]:
@@ -193,8 +228,7 @@ class SegmentPlanner:
 
     def plan_segments(
         self,
-        grasp: Grasp,
-        X_OG: RigidTransform,
+        candidate: GraspCandidate,
         carry_path: CarryPath,
         endpoints: tuple[EndpointContext, EndpointContext],
     ) -> tuple[TrajectorySegment, ...] | None:
@@ -202,18 +236,19 @@ class SegmentPlanner:
         empty = Payload()
         lift = carry_path.lift
         lowering = carry_path.reversed_lowering
-        paths_from_lift = self._tool.paths_home(lift[-1])
-        paths_from_lowering = self._tool.paths_home(lowering[-1])
+        tool = self._tools[candidate.tool]
+        paths_from_lift = tool.paths_home(lift[-1])
+        paths_from_lowering = tool.paths_home(lowering[-1])
         # Candidate waypoints and payload of each segment, in the order of planning.
         candidates = {
-            "carry": ([carry_path.waypoints], grasp.payload),
+            "carry": ([carry_path.waypoints], candidate.payload),
             "approach": ([np.vstack([lift, home[1:]])[::-1] for home in paths_from_lift], empty),
             "retreat": ([np.vstack([lowering, home[1:]]) for home in paths_from_lowering], empty),
         }
         segments = {}
         for progress, (name, (paths, payload)) in enumerate(candidates.items(), start=4):
             attempts = (
-                self._plan_segment(name, waypoints, payload, X_OG, endpoints, progress)
+                self._plan_segment(name, waypoints, payload, candidate, endpoints, progress)
                 for waypoints in paths
             )
             segment = next((attempt for attempt in attempts if attempt), None)
@@ -222,7 +257,7 @@ class SegmentPlanner:
             segments[name] = segment
         if self._config.optimize:
             segments = {
-                name: self._optimize_segment(segments[name], payload, X_OG, endpoints)
+                name: self._optimize_segment(segments[name], payload, candidate, endpoints)
                 for name, (_, payload) in candidates.items()
             }
         return segments["approach"], segments["carry"], segments["retreat"]
@@ -232,13 +267,13 @@ class SegmentPlanner:
         name: str,
         waypoints: Floats,
         payload: Payload,
-        X_OG: RigidTransform,
+        candidate: GraspCandidate,
         endpoints: tuple[EndpointContext, EndpointContext],
         progress: int,
     ) -> TrajectorySegment | None:
         """Return the segment along waypoints, or None after recording a failure."""
         path = bspline_path(waypoints)
-        min_distance = self._check_segment(name, path, X_OG, endpoints, progress)
+        min_distance = self._check_segment(name, path, candidate, endpoints, progress)
         if min_distance is None:
             return None
         trajectory = parameterize_time_optimal(path, self._cell, payload)
@@ -247,20 +282,20 @@ class SegmentPlanner:
             return None
         return TrajectorySegment(name, trajectory, min_distance, trajectory.end_time())
 
-    def set_up_segment(self, segment_name: str, X_OG: RigidTransform) -> None:
+    def set_up_segment(self, segment_name: str, candidate: GraspCandidate) -> None:
         """Set the pose of the picked object in the collision model for a segment."""
         name = self._picked.name
         X_TO = self._X_TO_place if segment_name == "retreat" else self._picked.X_TO
         self._collision_model.detach_object()
         self._collision_model.set_object_pose(name, X_TO)
         if segment_name == "carry":
-            self._collision_model.attach_object(name, X_OG)
+            self._collision_model.attach_object(name, candidate.tool, candidate.X_OG)
 
     def _check_segment(
         self,
         segment_name: str,
         path: Trajectory,
-        X_OG: RigidTransform,
+        candidate: GraspCandidate,
         endpoints: tuple[EndpointContext, EndpointContext],
         progress: int,
         spacing: float = MAX_JOINT_STEP / 2,
@@ -270,14 +305,14 @@ class SegmentPlanner:
         Args:
             segment_name: `approach`, `carry` or `retreat`.
             path: Path or trajectory in joint space.
-            X_OG: Grasp.
+            candidate: Grasp.
             endpoints: Pick and place endpoint.
             progress: Stage of planning, see `FailureLog.record`.
             spacing: Distance between checked configurations [rad].
         """
-        self.set_up_segment(segment_name, X_OG)
+        self.set_up_segment(segment_name, candidate)
         points = sample_path(path, spacing)
-        if segment_name == "carry" and self._exceeds_tilt(points, progress):
+        if segment_name == "carry" and self._exceeds_tilt(candidate, points, progress):
             return None
         if segment_name != "carry":
             context = self._arm_context(segment_name, endpoints)
@@ -298,18 +333,20 @@ class SegmentPlanner:
         """Return the endpoint of a segment on which no object is attached."""
         return endpoints[1] if segment_name == "retreat" else endpoints[0]
 
-    def _exceeds_tilt(self, path: Floats, progress: int) -> bool:
+    def _exceeds_tilt(self, candidate: GraspCandidate, path: Floats, progress: int) -> bool:
         """Return whether the tilt exceeds `MAX_CARRY_TILT`, and record that failure.
 
         Paths of robots with `vertical_tool_rows` do not tilt the gripper.
 
         Args:
+            candidate: Grasp.
             path: Configurations. Shape (m, n).
             progress: Stage of planning, see `FailureLog.record`.
         """
         if self._robot.vertical_tool_rows is not None:
             return False
-        tilt = float(np.linalg.norm(self._tool.axis(path)[:, :2], axis=1).max())
+        axis = self._tools[candidate.tool].axis(path)
+        tilt = float(np.linalg.norm(axis[:, :2], axis=1).max())
         if tilt > MAX_CARRY_TILT:
             self._failures.record(
                 progress, PlanningFailureReason.TRAJECTORY_INFEASIBLE, "carry", tilt
@@ -320,11 +357,11 @@ class SegmentPlanner:
         self,
         segment: TrajectorySegment,
         payload: Payload,
-        X_OG: RigidTransform,
+        candidate: GraspCandidate,
         endpoints: tuple[EndpointContext, EndpointContext],
     ) -> TrajectorySegment:
         """Return a faster trajectory of a segment, or the segment itself if none is found."""
-        self.set_up_segment(segment.name, X_OG)
+        self.set_up_segment(segment.name, candidate)
         min_distance = self._config.min_distance + OPTIMIZATION_MARGIN
         is_carry = segment.name == "carry"
         arm_context = self._arm_context(segment.name, endpoints)
@@ -349,8 +386,8 @@ class SegmentPlanner:
             keep_tool_vertical=is_carry,
             max_tool_acceleration=payload.max_axis_acceleration,
             nearby_distances=nearby_distances,
-            tool_jacobian=self._collision_model.gripper_jacobian,
-            tool_axis=self._tool.axis,
+            tool_jacobian=partial(self._collision_model.tool_jacobian, candidate.tool),
+            tool_axis=self._tools[candidate.tool].axis,
         )
         optimized = optimize_trajectory(problem)
         trajectory = scale_to_limits(optimized, self._cell, payload) if optimized else None
@@ -358,41 +395,41 @@ class SegmentPlanner:
             return segment
         # Optimized paths pass obstacles closely: the check is denser than that of the initial path.
         closest = self._check_segment(
-            segment.name, trajectory, X_OG, endpoints, 0, MAX_JOINT_STEP / 4
+            segment.name, trajectory, candidate, endpoints, 0, MAX_JOINT_STEP / 4
         )
         if closest is None:
             return segment
         return TrajectorySegment(segment.name, trajectory, closest, segment.unoptimized_duration)
 
     def plan_guarded_descent(
-        self, X_OG: RigidTransform, place: EndpointContext, q_place: Floats
+        self, candidate: GraspCandidate, place: EndpointContext, q_place: Floats
     ) -> Trajectory | None:
         """Return the vertical descent from the place pose as far as the arm is free.
 
         The attached object is ignored: it is expected to touch something.
 
         Args:
-            X_OG: Grasp.
+            candidate: Grasp.
             place: Endpoint at the place pose.
             q_place: Joint positions at the place pose. Shape (n,).
         """
-        X_place = (rigid_transform(self._X_TO_place) @ X_OG).GetAsMatrix4()
+        X_place = candidate.X_TG_place
         # A thin object may be lowered until the gripper is just above what is below.
         allowed = {
             pair: self._config.lip_gap / 2
             for pair in place.allowed_distances
-            if pair[0] in self._cell.gripper.contact_links
+            if pair[0] in self._cell.gripper.tools[candidate.tool].contact_links
         }
-        context = EndpointContext(place.p_TG_xy, allowed)
+        context = replace(place, allowed_distances=allowed)
         path = [q_place]
         heights = np.arange(0.0, self._config.max_guarded_descent + 1e-9, _DESCENT_STEP)
-        self.set_up_segment("retreat", X_OG)
+        self.set_up_segment("retreat", candidate)
         self._collision_model.set_object_pose(
             self._picked.name, self._X_TO_place.translated((0.0, 0.0, -10.0))
         )
         for previous, height in pairwise(heights):
             X_TG = np.array([raise_pose(X_place, -previous), raise_pose(X_place, -height)])
-            step = self._tool.track(X_TG, path[-1])
+            step = self._tools[candidate.tool].track(X_TG, path[-1])
             if step is None or self.min_distance_along(step[1:], context, 0, "the descent") is None:
                 break
             path.append(step[1])

@@ -1,6 +1,6 @@
 """Time parameterization: from joint-space waypoints to feasible trajectories.
 
-Frames: B is the robot's base, F is the flange, G is the gripper, Cm is the load's center of mass.
+Frames: B is the robot's base, F is the flange, Cm is the load's center of mass.
 """
 
 import math
@@ -45,7 +45,7 @@ _NUM_GRID_POINTS = 300
 
 @lru_cache(maxsize=64)
 def _cached_dynamics_plant(
-    cell: WorkCell, mass: float, p_GCm: tuple[float, float, float]
+    cell: WorkCell, mass: float, p_FCm: tuple[float, float, float]
 ) -> MultibodyPlant:
     plant = MultibodyPlant(0.0)
     robot = add_robot(plant, load_robot(cell.robot), visuals=False)
@@ -55,15 +55,14 @@ def _cached_dynamics_plant(
     if mass:
         inertia = SpatialInertia(mass, np.zeros(3), UnitInertia.SolidSphere(0.05))
         load = plant.AddRigidBody("load", robot, inertia)
-        frame = plant.GetFrameByName("cup", tool)
-        plant.WeldFrames(frame, load.body_frame(), RigidTransform(list(p_GCm)))
+        plant.WeldFrames(flange, load.body_frame(), RigidTransform(list(p_FCm)))
     plant.Finalize()
     return plant
 
 
 def dynamics_plant(cell: WorkCell, payload: Payload) -> MultibodyPlant:
     """Return a plant of arm, rigid gripper and load alone."""
-    return _cached_dynamics_plant(cell, payload.mass, payload.p_GCm)
+    return _cached_dynamics_plant(cell, payload.mass, payload.p_FCm)
 
 
 def min_travel_time(displacements: Floats, robot: RobotModel) -> Floats:
@@ -172,7 +171,7 @@ def parameterize_time_optimal(
     limits = np.broadcast_to(LIMIT_FRACTION * robot.acceleration_limits, dq_ds.shape)
     rows = [(dq_ds, d2q_ds2, -limits, limits)]
     if math.isfinite(payload.max_acceleration):
-        p_BCm = (robot.forward_kinematics(q) @ _p_FCm(cell, payload))[:, :3]
+        p_BCm = (robot.forward_kinematics(q) @ np.array([*payload.p_FCm, 1.0]))[:, :3]
         limits = np.full(p_BCm.shape, payload.max_axis_acceleration)
         dp_ds = np.gradient(p_BCm, grid, axis=0, edge_order=2)
         rows.append((dp_ds, np.gradient(dp_ds, grid, axis=0, edge_order=2), -limits, limits))
@@ -263,7 +262,7 @@ def scale_to_limits(trajectory: Trajectory, cell: WorkCell, payload: Payload) ->
     )
     squared_scale = max(squared_scale, (np.abs(dynamic) / torque_reserve).max())
     if math.isfinite(payload.max_acceleration):
-        p_BCm = (robot.forward_kinematics(q) @ _p_FCm(cell, payload))[:, :3]
+        p_BCm = (robot.forward_kinematics(q) @ np.array([*payload.p_FCm, 1.0]))[:, :3]
         accelerations = np.diff(p_BCm, 2, axis=0) / (end_time / (count - 1)) ** 2
         squared_scale = max(
             squared_scale, np.linalg.norm(accelerations, axis=1).max() / payload.max_acceleration
@@ -287,11 +286,6 @@ def sample_motion(trajectory: Trajectory, count: int) -> tuple[Floats, Floats, F
     times = np.linspace(trajectory.start_time(), trajectory.end_time(), count)
     v, a = (trajectory.MakeDerivative(order).vector_values(times).T for order in (1, 2))
     return trajectory.vector_values(times).T, v, a
-
-
-def _p_FCm(cell: WorkCell, payload: Payload) -> Floats:
-    """Return the load's center of mass in homogeneous coordinates [m]. Shape (4,)."""
-    return np.asarray(cell.gripper.X_FG.GetAsMatrix4() @ np.array([*payload.p_GCm, 1.0]))
 
 
 @lru_cache(maxsize=64)

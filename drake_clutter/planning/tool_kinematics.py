@@ -1,6 +1,6 @@
-"""Kinematics of robot and gripper, and paths along poses of the gripper.
+"""Kinematics of robot and tool, and paths along poses of the tool.
 
-Frames: T is the support, B is the robot's base, F is its flange, G is the gripper. Poses are
+Frames: T is the support, B is the robot's base, F is its flange, G is the tool. Poses are
 arrays, because the compiled kinematics of the robot takes them in batches.
 """
 
@@ -40,6 +40,28 @@ def downward_pose(yaw: float, p_TG: Floats) -> Floats:
     X = np.eye(4)
     X[:3, :3] = np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
     X[:3, 3] = p_TG
+    return X
+
+
+def turn_about_axis(X_TG: Floats, yaw: float) -> Floats:
+    """Return a pose turned about the axis of the tool.
+
+    Args:
+        X_TG: Pose of the tool. Shape (4, 4).
+        yaw: Angle about -z of G, thus about the vertical for a tool that points down [rad].
+
+    Returns:
+        Pose. Shape (4, 4).
+    """
+    c, s = math.cos(yaw), math.sin(yaw)
+    rotation = np.array([[c, s, 0.0, 0.0], [-s, c, 0.0, 0.0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    return np.asarray(X_TG @ rotation)
+
+
+def retreat_along_axis(X_TG: Floats, distance: float) -> Floats:
+    """Return a pose moved by a distance along -z of G [m]. Shapes (4, 4)."""
+    X = X_TG.copy()
+    X[:3, 3] -= distance * X_TG[:3, 2]
     return X
 
 
@@ -102,24 +124,25 @@ class CarryPath:
 
 
 class ToolKinematics:
-    """Forward and inverse kinematics of the gripper of a work cell.
+    """Forward and inverse kinematics of a tool of the gripper of a work cell.
 
     Attributes:
         robot: Robot that carries the gripper.
     """
 
-    def __init__(self, cell: WorkCell) -> None:
+    def __init__(self, cell: WorkCell, tool: str) -> None:
         """Load the robot.
 
         Args:
             cell: Work cell with robot and gripper.
+            tool: Name of the tool.
 
         Raises:
             InputError: The robot's model cannot be used.
         """
         self.robot: RobotModel = load_robot(cell.robot)
         X_TB = self.robot.X_TB
-        X_FG = cell.gripper.X_FG
+        X_FG = cell.gripper.tools[tool].X_FG
         self._X_TB = X_TB.GetAsMatrix4()
         self._X_FG = X_FG.GetAsMatrix4()
         self._X_BT = X_TB.inverse().GetAsMatrix4()

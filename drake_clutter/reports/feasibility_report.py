@@ -161,8 +161,7 @@ def _setups_table(setups: Mapping[str, WorkCell], summary: Mapping[str, Any]) ->
             (
                 name,
                 ", ".join(f"{value:g}" for value in base),
-                f"{1000 * cell.gripper.cup_diameter:g} mm",
-                f"{1000 * cell.gripper.extension:g} mm",
+                cell.gripper.description,
                 f"{cell.robot.payload:g} kg",
                 f"{statistics['planned']} of {statistics['moves']}",
                 "-" if fraction is None else f"{fraction:.3f} ({low:.3f} to {high:.3f})",
@@ -173,8 +172,7 @@ def _setups_table(setups: Mapping[str, WorkCell], summary: Mapping[str, Any]) ->
     columns = (
         "setup",
         "base x, y, z [m], yaw [deg]",
-        "cup diameter",
-        "tube length",
+        "gripper",
         "payload",
         "moves planned",
         "fraction planned (95 % CI)",
@@ -479,13 +477,13 @@ def _case_html(
 def _plan_key_frames(plan: PickPlacePlan, scene: Scene, cell: WorkCell) -> list[MotionSample]:
     """Return three frames of a plan: at the grasp, halfway to the place, and at the place."""
     carry = plan.segments[1].trajectory
-    tool = ToolKinematics(cell)
+    tool = ToolKinematics(cell, plan.tool)
     frames = []
     for time in (0.0, carry.end_time() / 2, carry.end_time()):
         q = carry.value(time).ravel()
         X_TO = RigidTransform(tool.pose(q)) @ plan.X_OG.inverse()
         poses = {**scene.poses, plan.pick: pose_from_transform(X_TO)}
-        frames.append(MotionSample(time, poses, ArmState(tuple(q.tolist()), (), (), True)))
+        frames.append(MotionSample(time, poses, ArmState(tuple(q.tolist()), (), (), plan.tool)))
     return frames
 
 

@@ -208,13 +208,13 @@ class ArmState:
         q: Joint positions [rad]. Shape (n,).
         v: Joint velocities [rad/s]. Shape (n,).
         torque: Torques of the motors [N m]. Shape (n,).
-        suction: Whether the vacuum is switched on.
+        tool: Name of the tool that is commanded to hold an object; "" for none.
     """
 
     q: tuple[float, ...]
     v: tuple[float, ...]
     torque: tuple[float, ...]
-    suction: bool
+    tool: str
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,10 @@
 """The work cell in a plant: robot on its pedestal, gripper, cameras and fixtures.
 
-Frames: T is the support's frame and the world, B the robot's base, F its flange, G the gripper's
-cup.
+Frames: T is the support's frame and the world, B the robot's base, F its flange, G a tool of the
+gripper.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,22 +30,22 @@ class Arm:
 
     Attributes:
         robot: Model instance of the robot.
-        tool: Model instance of the gripper.
+        gripper: Model instance of the gripper.
         joints: Names of the robot's joints, in the order of q.
         bodies: Bodies of robot and gripper.
         fixed: The world, to which the boxes of the cell are fixed, and bodies of fixtures with a
             model.
         flange: Frame F.
-        cup: Frame G.
+        tools: Frame G of each tool, by name; the first is preferred.
     """
 
     robot: ModelInstanceIndex
-    tool: ModelInstanceIndex
+    gripper: ModelInstanceIndex
     joints: tuple[str, ...]
     bodies: tuple[RigidBody, ...]
     fixed: tuple[RigidBody, ...]
     flange: Frame
-    cup: Frame
+    tools: Mapping[str, Frame]
 
 
 _PEDESTAL_COLOR = (0.45, 0.46, 0.48, 1.0)
@@ -69,7 +69,7 @@ def add_work_cell(
         plant: The plant.
         scene_graph: Its geometry engine.
         cell: The work cell.
-        compliant: Whether the gripper's cup is compliant, see `Gripper`.
+        compliant: Whether the gripper is compliant, see `Gripper.model_sdf`.
         visuals: Whether to add visual geometry, see `add_scene_plant`.
 
     Raises:
@@ -80,9 +80,10 @@ def add_work_cell(
     if not any(plant.GetCollisionGeometriesForBody(body) for body in _bodies(plant, robot)):
         problem = f"robot.model: {cell.robot.model!r}: no link has collision geometry"
         raise InputError(f"{problem}; expected a model with collision geometry")
-    (tool,) = Parser(plant).AddModelsFromString(cell.gripper.model_sdf(compliant=compliant), "sdf")
+    sdf = cell.gripper.model_sdf(compliant=compliant)
+    (gripper,) = Parser(plant).AddModelsFromString(sdf, "sdf")
     flange = plant.GetFrameByName(cell.robot.tool_frame, robot)
-    plant.WeldFrames(flange, plant.GetFrameByName("body", tool))
+    plant.WeldFrames(flange, plant.GetFrameByName("body", gripper))
     fixed = [plant.world_body()]
     for fixture in cell.fixtures:
         if fixture.box is None:
@@ -99,9 +100,11 @@ def add_work_cell(
         X_TS, size = pedestal
         _add_solid(plant, PEDESTAL_NAME, X_TS, Box(*size), _PEDESTAL_COLOR)
     filter_collisions(plant, scene_graph, model, robot)
-    bodies = _bodies(plant, robot, tool)
-    cup = plant.GetFrameByName("cup", tool)
-    return Arm(robot, tool, model.joint_names, bodies, tuple(fixed), flange, cup)
+    bodies = _bodies(plant, robot, gripper)
+    tools = {
+        name: plant.GetFrameByName(tool.link, gripper) for name, tool in cell.gripper.tools.items()
+    }
+    return Arm(robot, gripper, model.joint_names, bodies, tuple(fixed), flange, tools)
 
 
 def fixture_name(plant: MultibodyPlant, body: RigidBody) -> str:

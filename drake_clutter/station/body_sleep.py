@@ -85,10 +85,10 @@ def bodies_to_wake(
         at_place: Names of the objects affected by placing, see `affected_bodies`.
         time: Time since the start of the plan [s].
     """
-    pick_start = schedule.suction_on_time - WAKE_BEFORE_CONTACT
-    pick_end = schedule.suction_on_time + DWELL_TIME + SLEEP_AFTER_DWELL
+    pick_start = schedule.grasp_time - WAKE_BEFORE_CONTACT
+    pick_end = schedule.grasp_time + DWELL_TIME + SLEEP_AFTER_DWELL
     place_start = schedule.descent_start_time - WAKE_BEFORE_CONTACT
-    place_end = schedule.suction_off_time + DWELL_TIME + SLEEP_AFTER_DWELL
+    place_end = schedule.release_time + DWELL_TIME + SLEEP_AFTER_DWELL
     names = set[str]()
     if pick_start <= time <= pick_end:
         names |= at_pick

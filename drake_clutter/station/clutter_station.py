@@ -22,7 +22,12 @@ from drake_clutter.simulation.scene_plant import (
     add_scene_plant,
     rigid_transform,
 )
-from drake_clutter.station.grasp_constraint import CompliantGrasp, GraspConstraint, WeldGrasp
+from drake_clutter.station.grasp_constraint import (
+    CompliantGrasp,
+    GraspConstraint,
+    WeldGrasp,
+    WeldPair,
+)
 
 Floats = NDArray[np.float64]
 
@@ -43,7 +48,7 @@ class ClutterStation(Diagram):
         output_ports:
         - state
         - body_poses
-        - bellows
+        - gripper_state
         - query
 
     Input ports:
@@ -53,7 +58,8 @@ class ClutterStation(Diagram):
     Output ports:
         state: State of the plant. Shape (num_multibody_states,).
         body_poses: Poses of all bodies of the plant in the world, a list of `RigidTransform`.
-        bellows: Extension of the suction cup's bellows [m] and its rate [m/s]. Shape (2,).
+        gripper_state: Positions [m], then velocities [m/s] of the gripper's joints: the extensions
+            of the bellows, in the order of the cups. Shape (2 m,).
         query: `QueryObject` of `camera_scene_graph`. Only with visuals.
 
     Attributes:
@@ -63,7 +69,7 @@ class ClutterStation(Diagram):
         scene_plant: Plant with the bodies of the objects.
         plant: Plant of arm, cell and objects.
         arm: Frames and bodies of the arm in the plant.
-        grasp: Grasp constraint between suction cup and object.
+        grasp: Grasp constraint between a suction cup and an object.
         free_joints: Free joint of each object that can be locked, by name.
         camera_scene_graph: Scene graph with the visual geometry for cameras; None without visuals.
             It is separate from the scene graph of the contacts, because render engines update
@@ -76,7 +82,7 @@ class ClutterStation(Diagram):
         objects: Sequence[tuple[str, ObjectClass]],
         *,
         time_step: float,
-        weldable_object: str = "",
+        weld: WeldPair | None = None,
         visuals: bool = False,
     ) -> None:
         """Build the diagram.
@@ -85,15 +91,16 @@ class ClutterStation(Diagram):
             cell: Work cell.
             objects: Name and class of each object.
             time_step: Time step of the plant [s].
-            weldable_object: Name of the only object that can be grasped, with a `WeldGrasp`; "" for
-                a `CompliantGrasp` of any object.
+            weld: The only object that can be grasped, with a `WeldGrasp`; None for a
+                `CompliantGrasp` of any object.
             visuals: Whether to add visual geometry for cameras.
         """
         super().__init__()
         self.cell = cell
         self.object_classes = dict(objects)
         self.time_step = time_step
-        self._weldable_object = weldable_object
+        self._weld = weld
+        self._weldable_object = weld.object_name if weld else ""
         builder = DiagramBuilder()
         self.scene_plant: ScenePlant = add_scene_plant(
             builder,
@@ -101,20 +108,18 @@ class ClutterStation(Diagram):
             cell.support,
             time_step,
             visuals=False,
-            object_with_joint=weldable_object,
+            object_with_joint=self._weldable_object,
         )
         self.plant = plant = self.scene_plant.plant
         graph = self.scene_plant.scene_graph
         self.arm = add_work_cell(plant, graph, cell, compliant=True, visuals=False)
         _set_position_gains(plant, self.arm)
-        self.grasp = _make_grasp_constraint(
-            plant, self.arm, self.scene_plant.bodies, weldable_object
-        )
+        self.grasp = _make_grasp_constraint(plant, self.arm, cell, self.scene_plant.bodies, weld)
         plant.Finalize()
         self.free_joints = {
             name: plant.get_joint(index)
             for name, body in self.scene_plant.bodies.items()
-            if name != weldable_object
+            if name != self._weldable_object
             for index in plant.GetJointIndices(body.model_instance())
         }
         self._object_names = {
@@ -130,7 +135,7 @@ class ClutterStation(Diagram):
         builder.Connect(command.get_output_port(1), plant.get_actuation_input_port(self.arm.robot))
         builder.ExportOutput(plant.get_state_output_port(), "state")
         builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")
-        builder.ExportOutput(plant.get_state_output_port(self.arm.tool), "bellows")
+        builder.ExportOutput(plant.get_state_output_port(self.arm.gripper), "gripper_state")
         self.camera_scene_graph = self._add_camera_geometry(builder, objects) if visuals else None
         builder.BuildInto(self)
 
@@ -155,7 +160,7 @@ class ClutterStation(Diagram):
         ).bodies
         arm = add_work_cell(visual_plant, visual_graph, self.cell, compliant=True, visuals=True)
         # The joint of a `WeldGrasp` makes the states of both plants equal.
-        _make_grasp_constraint(visual_plant, arm, bodies, self._weldable_object)
+        _make_grasp_constraint(visual_plant, arm, self.cell, bodies, self._weld)
         visual_plant.Finalize()
         poses = builder.AddNamedSystem(
             "poses", MultibodyPositionToGeometryPose(visual_plant, input_multibody_state=True)
@@ -204,17 +209,17 @@ class ClutterStation(Diagram):
         """
         return np.asarray(self.plant.GetPositions(context)[self._q_indices])
 
-    def arm_state(self, context: Context, suction: bool) -> ArmState:
+    def arm_state(self, context: Context, tool: str) -> ArmState:
         """Return joint positions, velocities and torques of the arm.
 
         Args:
             context: Context of the plant.
-            suction: Whether the vacuum is commanded on.
+            tool: Name of the tool that is commanded to hold; "" for none.
         """
         torque = self.plant.get_net_actuation_output_port(self.arm.robot).Eval(context)
         q = self.joint_positions(context)
         v = self.plant.GetVelocities(context)[self._v_indices]
-        return ArmState(tuple(q.tolist()), tuple(v.tolist()), tuple(torque.tolist()), suction)
+        return ArmState(tuple(q.tolist()), tuple(v.tolist()), tuple(torque.tolist()), tool)
 
     def objects_in_contact(self, context: Context) -> set[str]:
         """Return the names of objects in contact with the arm or with other objects.
@@ -249,9 +254,13 @@ def _set_position_gains(plant: MultibodyPlant, arm: Arm) -> None:
 
 
 def _make_grasp_constraint(
-    plant: MultibodyPlant, arm: Arm, bodies: Mapping[str, RigidBody], weldable_object: str
+    plant: MultibodyPlant,
+    arm: Arm,
+    cell: WorkCell,
+    bodies: Mapping[str, RigidBody],
+    weld: WeldPair | None,
 ) -> GraspConstraint:
     """Return a `WeldGrasp` of the weldable object, or a `CompliantGrasp` without one."""
-    if weldable_object:
-        return WeldGrasp(plant, arm, bodies[weldable_object])
-    return CompliantGrasp(plant, arm)
+    if weld is not None:
+        return WeldGrasp(plant, arm, cell.gripper, weld.tool, bodies[weld.object_name])
+    return CompliantGrasp(plant, arm, cell.gripper)

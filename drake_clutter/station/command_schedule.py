@@ -1,4 +1,4 @@
-"""Command schedule of a plan: joint commands and suction over time."""
+"""Command schedule of a plan: joint commands and grasp times."""
 
 import math
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from drake_clutter.planning.time_parameterization import (
 Floats = NDArray[np.float64]
 
 DWELL_TIME = 0.15
-"""Time at rest in which the vacuum builds up or vanishes [s]."""
+"""Time at rest in which the gripper grasps or releases the object [s]."""
 SAMPLE_PERIOD = 0.01
 """Sample period of the command, which is linearly interpolated [s]."""
 
@@ -31,18 +31,18 @@ class CommandSchedule:
     Attributes:
         command: Desired positions [rad], desired velocities [rad/s] and feed-forward torques [N m]
             of n joints. Shape (3 n,).
-        suction_on_time: Time at which the vacuum is switched on [s].
-        descent_start_time: Time at which the guarded descent starts [s]; `suction_off_time` without
+        grasp_time: Time at which the gripper grasps the object [s].
+        descent_start_time: Time at which the guarded descent starts [s]; `release_time` without
             guarded descent.
-        suction_off_time: Time at which the vacuum is switched off [s].
+        release_time: Time at which the gripper releases the object [s].
         end_time: Time at which the arm is home again [s].
         stage_starts: Name and start time [s] of each stage.
     """
 
     command: PiecewisePolynomial
-    suction_on_time: float
+    grasp_time: float
     descent_start_time: float
-    suction_off_time: float
+    release_time: float
     end_time: float
     stage_starts: tuple[tuple[str, float], ...]
 
@@ -71,7 +71,7 @@ def build_command_schedule(
     """
     approach, carry, retreat = plan.segments
     empty = Payload()
-    loaded = Payload(plan.mass, plan.p_GCm)
+    loaded = plan.payload
     placement = list[tuple[str, Trajectory | None, Payload]]([("release", None, loaded)])
     if plan.guarded_descent is not None:
         descent = _truncate(plan.guarded_descent, contact_time)
@@ -112,9 +112,9 @@ def build_command_schedule(
     )
     return CommandSchedule(
         command=PiecewisePolynomial.FirstOrderHold(breaks, np.vstack(commands).T),
-        suction_on_time=start_of["grasp"],
+        grasp_time=start_of["grasp"],
         descent_start_time=start_of.get("descend", start_of["release"]),
-        suction_off_time=start_of["release"],
+        release_time=start_of["release"],
         end_time=time,
         stage_starts=tuple(stage_starts),
     )

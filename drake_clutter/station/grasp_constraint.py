@@ -1,12 +1,13 @@
-"""Grasp constraints: two models of an object attached to the suction cup.
+"""Grasp constraints: two models of an object attached to a suction cup.
 
 `WeldGrasp` locks a floating joint between cup and object. `CompliantGrasp` activates six distance
 constraints between them, arranged like the legs of a Stewart platform.
 
-Frames: G is the gripper, its origin at the center of the cup's lip; O is the object.
+Frames: G is a cup, its origin at the center of the lip; O is the object.
 """
 
 import math
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -16,15 +17,27 @@ from pydrake.multibody.plant import DistanceConstraintParams, MultibodyPlant
 from pydrake.multibody.tree import QuaternionFloatingJoint, RigidBody
 from pydrake.systems.framework import Context
 
-from drake_clutter.cell.epick import CUP_MASS
-from drake_clutter.cell.suction import GRAVITY
+from drake_clutter.cell.suction import GRAVITY, SuctionGripper
 from drake_clutter.simulation.cell_plant import Arm
 
 Floats = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class WeldPair:
+    """The only object that can be grasped with a `WeldGrasp`, and the tool that grasps it.
+
+    Attributes:
+        object_name: Name of the object.
+        tool: Name of the tool.
+    """
+
+    object_name: str
+    tool: str
+
+
 class GraspConstraint(Protocol):
-    """Attaches an object to the suction cup; created before the plant is finalized."""
+    """Attaches an object to a suction cup; created before the plant is finalized."""
 
     def reset(self, context: Context) -> None:
         """Detach any object; called once on every new context.
@@ -33,11 +46,12 @@ class GraspConstraint(Protocol):
             context: Context of the plant.
         """
 
-    def attach(self, context: Context, body: RigidBody) -> None:
+    def attach(self, context: Context, tool: str, body: RigidBody) -> None:
         """Attach an object at its current pose.
 
         Args:
             context: Context of the plant.
+            tool: Name of the cup.
             body: Body of the object.
         """
 
@@ -48,24 +62,34 @@ class GraspConstraint(Protocol):
             context: Context of the plant.
         """
 
-    def load(self, context: Context) -> tuple[Floats, Floats]:
+    def load(self, context: Context, tool: str) -> tuple[Floats, Floats]:
         """Return the load of the object on the lip.
 
         Args:
             context: Context of the plant.
+            tool: Name of the cup.
 
         Returns:
             Force [N] and moment [N m] in G. Shapes (3,).
         """
 
 
-def _cup_load(plant: MultibodyPlant, arm: Arm, context: Context) -> tuple[Floats, Floats]:
-    """Return force and moment in the bellows joint without the cup's weight, in G."""
-    bellows = plant.GetJointByName("bellows", arm.tool)
-    reaction = plant.get_reaction_forces_output_port().Eval(context)[bellows.index()]
-    down_G = -arm.cup.CalcPoseInWorld(context).rotation().matrix()[2]
-    weight = GRAVITY * CUP_MASS * down_G
-    return -np.asarray(reaction.translational() + weight), -np.asarray(reaction.rotational())
+class _CupLoad:
+    """Load on the cups of a suction gripper."""
+
+    def __init__(self, plant: MultibodyPlant, arm: Arm, gripper: SuctionGripper) -> None:
+        self._plant = plant
+        self._arm = arm
+        self._cups = {cup.name: cup for cup in gripper.cups}
+
+    def calc(self, context: Context, tool: str) -> tuple[Floats, Floats]:
+        """Return force and moment in the joint of the bellows without the cup's weight, in G."""
+        cup = self._cups[tool]
+        bellows = self._plant.GetJointByName(cup.bellows, self._arm.gripper)
+        reaction = self._plant.get_reaction_forces_output_port().Eval(context)[bellows.index()]
+        down_G = -self._arm.tools[tool].CalcPoseInWorld(context).rotation().matrix()[2]
+        weight = GRAVITY * cup.mass * down_G
+        return -np.asarray(reaction.translational() + weight), -np.asarray(reaction.rotational())
 
 
 class WeldGrasp:
@@ -74,10 +98,13 @@ class WeldGrasp:
     The joint replaces the free joint of the object, so only one object can be attached.
     """
 
-    def __init__(self, plant: MultibodyPlant, arm: Arm, body: RigidBody) -> None:
+    def __init__(
+        self, plant: MultibodyPlant, arm: Arm, gripper: SuctionGripper, tool: str, body: RigidBody
+    ) -> None:
         self._plant = plant
-        self._arm = arm
-        self._joint = plant.AddJoint(QuaternionFloatingJoint("hold", arm.cup, body.body_frame()))
+        self._cup = arm.tools[tool]
+        self._load = _CupLoad(plant, arm, gripper)
+        self._joint = plant.AddJoint(QuaternionFloatingJoint("hold", self._cup, body.body_frame()))
 
     def reset(self, context: Context) -> None:
         """Detach any object, see `GraspConstraint`."""
@@ -85,9 +112,9 @@ class WeldGrasp:
 
     def set_object_pose(self, context: Context, X_TO: RigidTransform) -> None:
         """Set the pose of the detached object."""
-        self._joint.SetPose(context, self._arm.cup.CalcPoseInWorld(context).inverse() @ X_TO)
+        self._joint.SetPose(context, self._cup.CalcPoseInWorld(context).inverse() @ X_TO)
 
-    def attach(self, context: Context, body: RigidBody) -> None:
+    def attach(self, context: Context, tool: str, body: RigidBody) -> None:
         """Attach the object of the joint, see `GraspConstraint`."""
         velocities = self._plant.GetVelocities(context)
         start = self._joint.velocity_start()
@@ -99,9 +126,9 @@ class WeldGrasp:
         """Detach the object, see `GraspConstraint`."""
         self._joint.Unlock(context)
 
-    def load(self, context: Context) -> tuple[Floats, Floats]:
+    def load(self, context: Context, tool: str) -> tuple[Floats, Floats]:
         """Return the load of the object on the lip, see `GraspConstraint`."""
-        return _cup_load(self._plant, self._arm, context)
+        return self._load.calc(context, tool)
 
 
 _PLATFORM_RADIUS = 0.08
@@ -145,28 +172,29 @@ class CompliantGrasp:
     They connect three points of the cup above the lip with three points of the object at the lip.
     """
 
-    def __init__(self, plant: MultibodyPlant, arm: Arm) -> None:
+    def __init__(self, plant: MultibodyPlant, arm: Arm, gripper: SuctionGripper) -> None:
         self._plant = plant
-        self._arm = arm
-        self._cup = plant.GetBodyByName("cup", arm.tool)
+        self._cups = arm.tools
+        self._load = _CupLoad(plant, arm, gripper)
         # Inactive constraints need two bodies, too.
-        other = plant.GetBodyByName("body", arm.tool)
+        cup = next(iter(arm.tools.values())).body()
+        other = plant.GetBodyByName("body", arm.gripper)
         self._legs = [
-            plant.AddDistanceConstraint(self._cup, upper, other, lower, 1.0)
-            for upper, lower in _LEGS
+            plant.AddDistanceConstraint(cup, upper, other, lower, 1.0) for upper, lower in _LEGS
         ]
 
     def reset(self, context: Context) -> None:
         """Detach any object, see `GraspConstraint`."""
         self.detach(context)
 
-    def attach(self, context: Context, body: RigidBody) -> None:
+    def attach(self, context: Context, tool: str, body: RigidBody) -> None:
         """Attach an object, see `GraspConstraint`."""
-        X_OG = body.EvalPoseInWorld(context).inverse() @ self._arm.cup.CalcPoseInWorld(context)
+        cup = self._cups[tool]
+        X_OG = body.EvalPoseInWorld(context).inverse() @ cup.CalcPoseInWorld(context)
         for leg, (upper, lower) in zip(self._legs, _LEGS, strict=True):
             length = float(np.linalg.norm(upper - lower))
             params = DistanceConstraintParams(
-                self._cup.index(),
+                cup.body().index(),
                 upper,
                 body.index(),
                 X_OG @ lower,
@@ -182,6 +210,6 @@ class CompliantGrasp:
         for leg in self._legs:
             self._plant.SetConstraintActiveStatus(context, leg, False)
 
-    def load(self, context: Context) -> tuple[Floats, Floats]:
+    def load(self, context: Context, tool: str) -> tuple[Floats, Floats]:
         """Return the load of the object on the lip, see `GraspConstraint`."""
-        return _cup_load(self._plant, self._arm, context)
+        return self._load.calc(context, tool)

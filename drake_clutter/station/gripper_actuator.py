@@ -30,6 +30,7 @@ class GraspStatus:
     """Status of a gripper since it was last commanded on.
 
     Attributes:
+        tool: Name of the tool that was commanded on last; "" for none.
         held: Name of the object that is held; "" for none.
         last_held: Name of the object that was held last; "" for none.
         release_time: Time at which the object detached by overload [s]; NaN if it did not.
@@ -38,6 +39,7 @@ class GraspStatus:
             the release.
     """
 
+    tool: str = ""
     held: str = ""
     last_held: str = ""
     release_time: float = math.nan
@@ -76,27 +78,30 @@ class GripperActuator(Protocol):
 
 
 class SuctionActuator:
-    """Switches the grasp constraint between suction cup and object.
+    """Switches the grasp constraint between a suction cup and an object.
+
+    Only the cup that is commanded on has a vacuum.
 
     Attributes:
         status: Status of the gripper.
     """
 
-    def __init__(self, station: ClutterStation, is_commanded_on: Callable[[Context], bool]) -> None:
+    def __init__(self, station: ClutterStation, commanded_tool: Callable[[Context], str]) -> None:
         """Create an actuator.
 
         Args:
-            station: Station with the suction cup.
-            is_commanded_on: Returns whether the vacuum is commanded on, from the root context.
+            station: Station with the suction gripper.
+            commanded_tool: Returns the name of the cup whose vacuum is commanded on, "" for none,
+                from the root context.
         """
         self._station = station
-        self._is_commanded_on = is_commanded_on
+        self._commanded_tool = commanded_tool
         self.reset()
 
     def reset(self) -> None:
         """Reset the status, see `GripperActuator`."""
         self.status = GraspStatus()
-        self._was_commanded_on = False
+        self._last_tool = ""
         self._num_overloads = 0  # consecutive updates with overload
         self._last_update = -math.inf
         self._X_OG = RigidTransform()  # at the last attachment
@@ -108,22 +113,23 @@ class SuctionActuator:
             return
         self._last_update = time
         context = self._station.plant_context(root)
-        is_on = self._is_commanded_on(root)
-        if is_on and not self._was_commanded_on:
-            self.status = GraspStatus(held=self.status.held)
-            self._num_overloads = 0
-        self._was_commanded_on = is_on
-        if is_on and not self.status.held and not self.status.lost_object:
-            self._try_attach(context)
-        elif self.status.held and not is_on:
+        tool = self._commanded_tool(root)
+        if self.status.held and tool != self.status.tool:
             self._release(context)
+        if tool and tool != self._last_tool:
+            self.status = GraspStatus(tool)
+            self._num_overloads = 0
+        self._last_tool = tool
+        if tool and not self.status.held and not self.status.lost_object:
+            self._try_attach(context)
         elif self.status.held:
             self._check_overload(context, time)
 
     def _check_overload(self, context: Context, time: float) -> None:
         """Release the object after an overload of `OVERLOAD_RELEASE_TIME`."""
-        force, moment = self._station.grasp.load(context)
-        ratio = float(self._station.cell.gripper.load_ratio(force, moment))
+        tool = self.status.tool
+        force, moment = self._station.grasp.load(context, tool)
+        ratio = float(self._station.cell.gripper.load_ratio(tool, force, moment))
         max_ratio = max(self.status.max_load_ratio, ratio)
         self.status = replace(self.status, max_load_ratio=max_ratio)
         self._num_overloads = self._num_overloads + 1 if ratio > 1 else 0
@@ -133,26 +139,26 @@ class SuctionActuator:
 
     def _cup_pose_in_object(self, context: Context, name: str) -> RigidTransform:
         """Return X_OG of an object."""
-        X_TG = self._station.arm.cup.CalcPoseInWorld(context)
+        X_TG = self._station.arm.tools[self.status.tool].CalcPoseInWorld(context)
         X_TO = self._station.scene_plant.bodies[name].EvalPoseInWorld(context)
         return X_TO.inverse() @ X_TG
 
     def _try_attach(self, context: Context) -> None:
         """Attach the object that is closest below the lip, if the lip seals on it."""
         station = self._station
-        suction = station.cell.gripper
+        gripper = station.cell.gripper
+        tool = self.status.tool
+        diameter = gripper.cup(tool).diameter
         X_OG = {name: self._cup_pose_in_object(context, name) for name in station.graspable_objects}
         gaps = {
-            name: lip_surface_profile(
-                station.object_classes[name], X_OG[name], suction.cup_diameter
-            ).min()
+            name: lip_surface_profile(station.object_classes[name], X_OG[name], diameter).min()
             for name in X_OG
         }
         if not gaps:
             return
         closest = min(gaps, key=lambda name: gaps[name])
-        if suction.can_attach(station.object_classes[closest], X_OG[closest]):
-            station.grasp.attach(context, station.scene_plant.bodies[closest])
+        if gripper.can_attach(tool, station.object_classes[closest], X_OG[closest]):
+            station.grasp.attach(context, tool, station.scene_plant.bodies[closest])
             self.status = replace(self.status, held=closest, last_held=closest)
             self._X_OG = X_OG[closest]
 

@@ -1,4 +1,4 @@
-"""Executor of pick-and-place plans: a LeafSystem that commands joints and suction."""
+"""Executor of pick-and-place plans: a LeafSystem that commands joints and gripper."""
 
 import math
 from dataclasses import dataclass, replace
@@ -91,22 +91,24 @@ class PickPlaceExecutor(LeafSystem):
         name: PickPlaceExecutor
         input_ports:
         - plan
-        - bellows
+        - gripper_state
         output_ports:
         - command
-        - suction
+        - hold
         - finished
         - status
 
     Input ports:
         plan: `PlannedMove`. A plan with a new number starts as soon as the previous one has ended.
-        bellows: Extension of the bellows [m] and its rate [m/s]. A guarded descent ends when they
-            are compressed, or at its planned end. Shape (2,).
+        gripper_state: Positions [m], then velocities [m/s] of the gripper's m joints. A guarded
+            descent ends when the bellows of the tool are compressed, or at its planned end. Shape
+            (2 m,).
 
     Output ports:
         command: Desired positions [rad], desired velocities [rad/s] and feed-forward torques [N m]
             of n joints. Shape (3 n,).
-        suction: 1 if the vacuum is commanded on, else 0. Shape (1,).
+        hold: 1 for the tool that is commanded to hold an object, else 0; in the order of the
+            gripper's tools. Shape (num_tools,).
         finished: Number of the last plan if it has ended, else 0; and distance between planned and
             actual release height [m]. Shape (2,).
         status: `ExecutorStatus`.
@@ -126,7 +128,9 @@ class PickPlaceExecutor(LeafSystem):
         gravity = inverse_dynamics(dynamics_plant(cell, Payload()), home, zero, zero)
         self._home_command = np.hstack([home, zero, gravity]).ravel()
         self._plan = self.DeclareAbstractInputPort("plan", AbstractValue.Make(PlannedMove()))
-        self._bellows = self.DeclareVectorInputPort("bellows", 2)
+        self._tools = cell.gripper.tools
+        num_joints = sum(tool.compliant_joint is not None for tool in self._tools.values())
+        self._gripper_state = self.DeclareVectorInputPort("gripper_state", 2 * num_joints)
         self._state = self.DeclareAbstractState(AbstractValue.Make(ExecutorState()))
         self.DeclarePeriodicUnrestrictedUpdateEvent(EXECUTOR_UPDATE_PERIOD, 0.0, self._update)
         self.DeclareInitializationUnrestrictedUpdateEvent(self._update)
@@ -134,7 +138,7 @@ class PickPlaceExecutor(LeafSystem):
         self.DeclareVectorOutputPort(
             "command", len(self._home_command), self._calc_command, prerequisites
         )
-        self.DeclareVectorOutputPort("suction", 1, self._calc_suction, prerequisites)
+        self.DeclareVectorOutputPort("hold", len(self._tools), self._calc_hold, prerequisites)
         self.DeclareVectorOutputPort("finished", 2, self._calc_finished, prerequisites)
         self.DeclareAbstractOutputPort(
             "status", lambda: AbstractValue.Make(ExecutorStatus()), self._calc_status, prerequisites
@@ -170,14 +174,17 @@ class PickPlaceExecutor(LeafSystem):
     def _detect_contact(self, context: Context, state: ExecutorState) -> ExecutorState:
         """Return the state, updated if contact occurs during a guarded descent."""
         schedule = state.schedule
-        if schedule is None or state.plan is None or not self._bellows.HasValue(context):
+        if schedule is None or state.plan is None or not self._gripper_state.HasValue(context):
             return state
-        descent_duration = schedule.suction_off_time - schedule.descent_start_time
+        joint = self._tools[state.plan.tool].compliant_joint
+        if joint is None:
+            return state
+        descent_duration = schedule.release_time - schedule.descent_start_time
         descent_time = context.get_time() - state.start_time - schedule.descent_start_time
         is_descending = 0 < descent_time < descent_duration
         if not is_descending or math.isfinite(state.contact_time):
             return state
-        extension = float(self._bellows.Eval(context)[0])
+        extension = float(self._gripper_state.Eval(context)[joint])
         is_first = math.isnan(state.bellows_extension)
         initial_extension = extension if is_first else state.bellows_extension
         if extension > max(initial_extension - CONTACT_COMPRESSION, MIN_BELLOWS_EXTENSION):
@@ -197,13 +204,14 @@ class PickPlaceExecutor(LeafSystem):
             time = state.elapsed(context.get_time())
             output.SetFromVector(state.schedule.command.value(time).ravel())
 
-    def _calc_suction(self, context: Context, output: BasicVector) -> None:
+    def _calc_hold(self, context: Context, output: BasicVector) -> None:
         state = self.state(context)
-        is_on = False
-        if state.schedule is not None:
+        held = ""
+        if state.schedule is not None and state.plan is not None:
             time = state.elapsed(context.get_time())
-            is_on = state.schedule.suction_on_time <= time < state.schedule.suction_off_time
-        output.SetFromVector([float(is_on)])
+            if state.schedule.grasp_time <= time < state.schedule.release_time:
+                held = state.plan.tool
+        output.SetFromVector([float(name == held) for name in self._tools])
 
     def _calc_finished(self, context: Context, output: BasicVector) -> None:
         state = self.state(context)

@@ -18,6 +18,7 @@ from drake_clutter.scenes.interfaces import MotionSample
 from drake_clutter.scenes.scene import Pose, Scene, tilt_between
 from drake_clutter.station.body_sleep import BodySleepManager, affected_bodies, bodies_to_wake
 from drake_clutter.station.clutter_station import ClutterStation
+from drake_clutter.station.grasp_constraint import WeldPair
 from drake_clutter.station.gripper_actuator import GripperActuator, SuctionActuator
 from drake_clutter.station.messages import PlannedMove
 from drake_clutter.station.pick_place_executor import ExecutorState, PickPlaceExecutor
@@ -104,7 +105,7 @@ class StationSimulation:
         cell: WorkCell,
         scene: Scene,
         *,
-        weldable_object: str = "",
+        weld: WeldPair | None = None,
         visuals: bool = False,
         add_systems: AddSystems | None = None,
     ) -> None:
@@ -113,8 +114,7 @@ class StationSimulation:
         Args:
             cell: Work cell; its support is replaced by that of the scene.
             scene: Objects at rest.
-            weldable_object: Name of the only object that can be grasped; "" for any, see
-                `ClutterStation`.
+            weld: The only object that can be grasped; None for any, see `ClutterStation`.
             visuals: Whether to add visual geometry for cameras.
             add_systems: Adds further systems, such as a planner; None if plans are passed to
                 `execute`.
@@ -131,21 +131,21 @@ class StationSimulation:
                 self.cell,
                 named_classes,
                 time_step=TIME_STEP,
-                weldable_object=weldable_object,
+                weld=weld,
                 visuals=visuals,
             ),
         )
         self.executor = PickPlaceExecutor.AddToBuilder(builder, cell=self.cell)
         for source, target, port in (
             (self.executor, self.station, "command"),
-            (self.station, self.executor, "bellows"),
+            (self.station, self.executor, "gripper_state"),
         ):
             builder.Connect(source.GetOutputPort(port), target.GetInputPort(port))
         if add_systems is not None:
             add_systems(builder, self.station, self.executor)
         self.diagram: Diagram = builder.Build()
         make_actuator = _ACTUATORS[self.cell.gripper.kind]
-        self.gripper: GripperActuator = make_actuator(self.station, self._is_suction_on)
+        self.gripper: GripperActuator = make_actuator(self.station, self._commanded_tool)
         self._sleep = BodySleepManager(self.station)
         self.reset(scene)
 
@@ -214,7 +214,7 @@ class StationSimulation:
                 state.schedule, self._affected_at_pick, self._affected_at_place, elapsed
             )
             end = state.schedule.end_time + POST_MOTION_WAIT
-            expects_grasp = state.schedule.suction_on_time + STEP_PERIOD <= elapsed < end
+            expects_grasp = state.schedule.grasp_time + STEP_PERIOD <= elapsed < end
         self._sleep.update(self.root, required, self.gripper.status, expects_grasp=expects_grasp)
         self._num_steps += 1
         self.simulator.AdvanceTo(self._num_steps * STEP_PERIOD + TIME_STEP / 2)
@@ -227,7 +227,7 @@ class StationSimulation:
     def sample(self) -> MotionSample:
         """Return the state of arm and objects, with the time since the last plan's start."""
         context = self.plant_context
-        arm = self.station.arm_state(context, self._is_suction_on(self.root))
+        arm = self.station.arm_state(context, self._commanded_tool(self.root))
         time = self.root.get_time() - self.executor_state.start_time
         return MotionSample(time, self.station.scene_plant.poses(context), arm)
 
@@ -298,9 +298,18 @@ class StationSimulation:
         q_desired = command.Eval(self.executor.GetMyContextFromRoot(self.root))[: len(q)]
         return float(np.abs(q_desired - q).max())
 
-    def _is_suction_on(self, root: Context) -> bool:
+    def _commanded_tool(self, root: Context) -> str:
+        """Return the name of the tool that is commanded to hold an object; "" for none."""
         context = self.executor.GetMyContextFromRoot(root)
-        return bool(self.executor.GetOutputPort("suction").Eval(context)[0] > 0.5)
+        hold = self.executor.GetOutputPort("hold").Eval(context)
+        return next(
+            (
+                name
+                for name, on in zip(self.cell.gripper.tools, hold.tolist(), strict=True)
+                if on > 0.5
+            ),
+            "",
+        )
 
     def _monitor(self, root: Context) -> EventStatus:
         self.gripper.update(root)

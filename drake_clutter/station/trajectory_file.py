@@ -7,13 +7,14 @@ Attributes of the file:
     cell     `WorkCell` as YAML.
 
 Each executed move has a group `move_0001`, `move_0002`, ... with the attributes `pick`, `place`,
-`result` and `detail`. Its datasets have m samples of an arm with n joints:
+`result`, `detail` and `tool`, the name of the gripper's tool that holds the object. Its datasets
+have m samples of an arm with n joints:
 
     time     (m,)             Time since the start of the move [s].
     q        (m, n)           Joint positions [rad].
     v        (m, n)           Joint velocities [rad/s].
     torque   (m, n)           Joint torques of the actuators [N m].
-    suction  (m,)             Whether the vacuum is commanded on.
+    suction  (m,)             Whether the tool is commanded to hold the object.
     X_TO     (m, objects, 7)  Quaternion (w, x, y, z) and position (x, y, z) [m] of each object, in
                               the order of the scene file.
 """
@@ -79,13 +80,14 @@ def write_trajectories(
                     "place": move.place,
                     "result": outcome.result.value,
                     "detail": outcome.detail,
+                    "tool": next((state.tool for state in states if state.tool), ""),
                 }
             )
             arrays = {
                 name: np.array([getattr(state, name) for state in states]) for name in _ARM_DATASETS
             }
             arrays["time"] = np.array([sample.time for sample in outcome.motion])
-            arrays["suction"] = np.array([state.suction for state in states])
+            arrays["suction"] = np.array([bool(state.tool) for state in states])
             poses = [
                 [sample.poses[o.name] for o in initial_scene.objects] for sample in outcome.motion
             ]
@@ -120,7 +122,10 @@ def read_trajectories(
         scene = scene_from_yaml(str(file.attrs["scene"]), f"{path}:scene", catalog).scene
         cell = _read_cell(path, file.attrs).with_support(scene.support)
         num_joints = load_robot(cell.robot).num_joints
-        moves = [_read_move(path, name, file[name], scene, num_joints) for name in sorted(file)]
+        tool = next(iter(cell.gripper.tools))  # of files without the attribute
+        moves = [
+            _read_move(path, name, file[name], scene, num_joints, tool) for name in sorted(file)
+        ]
         return scene, cell, moves
 
 
@@ -135,7 +140,7 @@ def _read_cell(path: Path, attributes: Mapping[str, Any]) -> WorkCell:
 
 
 def _read_move(
-    path: Path, name: str, group: h5py.Group, scene: Scene, num_joints: int
+    path: Path, name: str, group: h5py.Group, scene: Scene, num_joints: int, default_tool: str
 ) -> tuple[Move, tuple[MotionSample, ...]]:
     """Return the move of a group and its samples."""
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_ARM_DATASETS, (num_joints,))
@@ -161,10 +166,11 @@ def _read_move(
     lengths = {field: len(values) for field, values in arrays.items()}
     if len(set(lengths.values())) != 1:
         raise InputError(f"{path}:{name}: lengths {lengths}; expected equal lengths")
+    tool = str(group.attrs.get("tool", default_tool))
     samples = []
     for k, time in enumerate(arrays["time"].tolist()):
         q, v, torque = (tuple(arrays[field][k].tolist()) for field in _ARM_DATASETS)
-        arm = ArmState(q, v, torque, bool(arrays["suction"][k]))
+        arm = ArmState(q, v, torque, tool if arrays["suction"][k] else "")
         rows = arrays["X_TO"][k].tolist()
         poses = {
             o.name: Pose(tuple(row[4:]), tuple(row[:4]))

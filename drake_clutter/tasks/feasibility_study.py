@@ -75,6 +75,7 @@ class MoveRecord:
             3 cm.
         nearest_pair: Names of the two bodies at the smallest distance.
         manipulability: Smaller of the manipulabilities at the grasp and at the release [m^3].
+        tool: Name of the gripper's tool that holds the object; "" without a plan.
     """
 
     setup: str
@@ -99,6 +100,7 @@ class MoveRecord:
     clearance: float = math.nan
     nearest_pair: str = ""
     manipulability: float = math.nan
+    tool: str = ""
 
 
 MOVE_RECORD_FIELDS = tuple(field.name for field in fields(MoveRecord))
@@ -230,7 +232,8 @@ class FeasibilityStudy:
             num_attempts=plan.num_attempts,
             clearance=round(nearest.distance, 6),
             nearest_pair=" and ".join(nearest.pair) if math.isfinite(nearest.distance) else "",
-            manipulability=float(planner.tool.robot.manipulability(endpoints).min()),
+            manipulability=float(planner.robot.manipulability(endpoints).min()),
+            tool=plan.tool,
         )
 
     def evaluate_pose_errors(
@@ -281,16 +284,16 @@ class FeasibilityStudy:
         q_pick = plan.segments[1].trajectory.value(0.0).ravel()
         picked = scene[plan.pick]
         gripper = self._config.cell.gripper
-        X_TG = RigidTransform(planner.tool.pose(q_pick))
+        X_TG = RigidTransform(planner.tools[plan.tool].pose(q_pick))
         X_OG = rigid_transform(picked.X_TO).InvertAndCompose(X_TG)
-        if not gripper.can_attach(picked.object_class, X_OG):
+        if not gripper.can_attach(plan.tool, picked.object_class, X_OG):
             return PlanningFailureReason.NO_SEAL.value
         collision_model = planner.collision_model(scene.objects)
-        contact_bodies = (*gripper.contact_links, plan.pick)
+        contact_bodies = (*gripper.tools[plan.tool].contact_links, plan.pick)
         for segment in plan.segments:
             collision_model.set_object_poses(scene.objects)
             if segment.name == "carry":
-                collision_model.attach_object(plan.pick, X_OG)
+                collision_model.attach_object(plan.pick, plan.tool, X_OG)
             else:
                 collision_model.set_object_pose(
                     plan.pick, picked.X_TO if segment.name == "approach" else plan.X_TO_place
