@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import CLASSES, TRAY, resting, rng, scene_of
+from conftest import CLASSES, TRAY, resting, rng, scene_of, tray
 from scipy.spatial.transform import Rotation
 
 from drake_clutter.config import ClutterConfig, SettleConfig
@@ -14,7 +14,7 @@ from drake_clutter.grammar import Orientation
 from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
 from drake_clutter.scenes.scene import Pose, SceneObject, perturb_poses, tilt_between
 from drake_clutter.simulation.drake_judge import DrakeJudge
-from drake_clutter.simulation.settle import SettleResult, settle
+from drake_clutter.simulation.settle import SettleResult, find_instability, settle
 
 UPRIGHT = Orientation.UPRIGHT_0
 # Cracker boxes are 230 mm long (x) and 60 mm high; a sugar box is 175 mm long, so half of it
@@ -112,6 +112,44 @@ def test_what_falls(
         verdict.instability.displacement >= limits.max_displacement
         or verdict.instability.tilt >= math.radians(limits.max_tilt_deg)
     )
+
+
+@pytest.mark.parametrize(
+    ("displacement", "tilt_deg", "reason"),
+    [
+        (0.0099, 7.9, None),
+        (0.0101, 0.0, InstabilityReason.SLID),
+        (0.0101, 7.9, InstabilityReason.SLID),
+        (0.0, 8.1, InstabilityReason.TOPPLED),
+        (0.0101, 8.1, InstabilityReason.TOPPLED),
+    ],
+)
+def test_a_stable_object_moves_less_than_10_mm_and_turns_less_than_8_deg(
+    displacement: float, tilt_deg: float, reason: InstabilityReason | None
+) -> None:
+    before = resting("cracker_box")
+    R_TO = Rotation.from_euler("x", tilt_deg, degrees=True).as_matrix() @ before.X_TO.rotation
+    p_TO = before.X_TO.p + displacement * np.array([0.36, 0.48, 0.8])
+    found = find_instability(before, Pose.from_rotation(R_TO, p_TO), TRAY, SettleConfig())
+    if reason is None:
+        assert found is None
+        return
+    assert found is not None
+    assert (found.reason, found.object) == (reason, "cracker_box")
+    assert found.displacement == pytest.approx(displacement)
+    assert found.tilt == pytest.approx(math.radians(tilt_deg), abs=1e-7)
+
+
+@pytest.mark.parametrize("p_TO", [(0.351, 0.0, 0.03), (0.0, -0.351, 0.03), (0.0, 0.0, -0.001)])
+def test_an_object_beside_or_below_the_tray_has_left_it(p_TO: tuple[float, float, float]) -> None:
+    before = resting("cracker_box")
+    found = find_instability(before, Pose(p_TO, before.X_TO.quaternion), tray(0.70), SettleConfig())
+    assert found is not None
+    assert found.reason is InstabilityReason.LEFT_TRAY
+    inside = Pose((0.349, -0.349, 0.0), before.X_TO.quaternion)
+    found = find_instability(before, inside, tray(0.70), SettleConfig())
+    assert found is not None
+    assert found.reason is InstabilityReason.SLID
 
 
 def test_the_same_rng_gives_the_same_poses_bit_for_bit(

@@ -171,6 +171,14 @@ def test_load_ratios_of_simple_loads() -> None:
     assert SUCTION.load_ratio(
         "single", np.array([[0.0, 0, 10], [0, 0, 20]]), np.zeros((2, 3))
     ) == pytest.approx(np.array([10, 20]) / SUCTION.holding_force("single"))
+    sliding = SUCTION.friction * SUCTION.holding_force("single")
+    twist = sliding * 0.0125
+    assert SUCTION.load_ratio("single", zero, np.array([0.0, 0.0, twist])) == pytest.approx(1.0)
+    assert SUCTION.load_ratio(
+        "single", np.array([0.0, 0.6 * sliding, 0.0]), np.array([0.0, 0.0, -0.8 * twist])
+    ) == pytest.approx(1.0), "a shear and a twist add up as legs of a right triangle"
+    half = np.array([0.3 * sliding, 0.0, SUCTION.holding_force("single") / 2])
+    assert SUCTION.load_ratio("single", half, zero) == pytest.approx(0.6), "half is left"
 
 
 def test_the_wrench_of_a_load_at_rest_is_its_weight() -> None:
