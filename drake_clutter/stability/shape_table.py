@@ -15,6 +15,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from drake_clutter.catalog import ObjectClass, Shape
+from drake_clutter.compilation import zero_records
 from drake_clutter.scenes.scene import SceneObject
 
 Floats = NDArray[np.float64]
@@ -258,7 +259,7 @@ class ShapeArrays(NamedTuple):
 def _allocate(rows: int, faces: int, corners: int) -> ShapeArrays:
     """Return empty arrays of the given capacities."""
     return ShapeArrays(
-        np.zeros(rows, SHAPE_DTYPE),
+        zero_records(rows, SHAPE_DTYPE),
         np.zeros(faces + 1, np.int64),
         np.zeros((faces, 3)),
         np.zeros((corners, 3)),
