@@ -368,16 +368,9 @@ _SYMBOLS: dict[type[ast.operator], str] = {
     ast.RShift: ">>",
 }
 _COMPARISON_SYMBOLS: dict[type[ast.cmpop], str] = {
-    ast.Lt: "<",
-    ast.LtE: "<=",
-    ast.Gt: ">",
-    ast.GtE: ">=",
-    ast.Eq: "==",
-    ast.NotEq: "!=",
-    ast.Is: "is",
-    ast.IsNot: "is not",
-    ast.In: "in",
-    ast.NotIn: "not in",
+    type(comparison.ops[0]): symbol
+    for symbol in COMPARISONS
+    if isinstance(comparison := ast.parse(f"a {symbol} b", mode="eval").body, ast.Compare)
 }
 
 

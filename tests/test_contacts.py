@@ -94,7 +94,8 @@ def overlap(i: SceneObject, j: SceneObject, measure_gap: bool = True) -> float:
     """Return the overlap of the footprints of two objects."""
     shapes = ShapeTable()
     rows, p_T = shapes.rows_and_positions([i, j])
-    return float(contacts._overlap(shapes.arrays.table, *rows, *p_T, measure_gap))
+    table = shapes.arrays.table
+    return float(contacts._overlap(table, rows[0], rows[1], p_T[0], p_T[1], measure_gap))
 
 
 @pytest.mark.parametrize("direction", [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
@@ -120,7 +121,8 @@ def test_what_an_object_does_not_cover_of_the_top_below() -> None:
     upper = resting("sugar_box", xy=(0.3 + 0.115, -0.2), floor=0.06)
     shapes = ShapeTable()
     rows, p_T = shapes.rows_and_positions([LOWER, upper])
-    found = contacts.uncovered_top(shapes.arrays.table, *rows, *p_T, 0.002)
+    table = shapes.arrays.table
+    found = contacts.uncovered_top(table, rows[0], rows[1], p_T[0], p_T[1], 0.002)
     length, width = np.ptp(upper.corners_T[:, :2], axis=0)
     edge = 0.115 - length / 2 - 0.002
     side = width / 2 + 0.002

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 from conftest import resting
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.stability import equilibrium
@@ -25,7 +25,7 @@ DIRECTIONS = [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]
 def residuals(
     objects: Sequence[SceneObject] = (BOX,),
     pairs: Sequence[tuple[int, int]] = ((GROUND, 0),),
-    offsets: Sequence[Sequence[float]] = ((0.0, 0.0),),
+    offsets: ArrayLike = ((0.0, 0.0),),
     *,
     margin: float = 0.0,
     friction: float = 0.0,
@@ -45,7 +45,7 @@ def residuals(
             p_T,
             np.array(pairs, np.int64).reshape(-1, 2),
             np.full(len(objects), margin),
-            np.array(offsets, float),
+            np.asarray(offsets, float),
             friction,
             loads,
         )
@@ -166,14 +166,14 @@ def test_an_object_stands_while_its_center_of_mass_is_above_its_foot(
 def test_the_center_of_mass_moves_of_one_object_on_cylinders_at_a_time(
     reach: float, expected: tuple[int, bool]
 ) -> None:
-    """Two storeys of a box on two markers, of which the lower ones are 2 s apart.
+    """Two levels of a box on two markers, of which the lower ones are 2 s apart.
 
     With the margin e, the center of mass of the whole moves by 0.48 e with one of the boxes and by
     0.96 e with both. It stands within s.
     """
     objects = list[SceneObject]()
-    for storey, half_distance in enumerate((reach, 0.05)):
-        floor = 0.078 * storey
+    for level, half_distance in enumerate((reach, 0.05)):
+        floor = 0.078 * level
         for y in (-half_distance, half_distance):
             objects.append(resting("large_marker", xy=(0.0, y), floor=floor))
         objects.append(resting("cracker_box", floor=floor + 0.018))
