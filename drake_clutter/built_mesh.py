@@ -22,6 +22,7 @@ class MeshMeasures(StrictModel):
 
     Attributes:
         sha256: Hash of the mesh file, see `hash_mesh_file`.
+        scale: Unit of the file's coordinates [m].
         extents: Extents of the bounding box [m]. Shape (3,).
         repairs: What the build repaired.
         max_bulge: Largest distance of the convex pieces beyond the surface [m].
@@ -29,6 +30,7 @@ class MeshMeasures(StrictModel):
     """
 
     sha256: str
+    scale: float
     extents: tuple[float, float, float]
     repairs: tuple[str, ...]
     max_bulge: float
@@ -47,17 +49,19 @@ def hash_mesh_file(path: Path) -> str:
     return digest.hexdigest()
 
 
-def read_mesh_measures(folder: Path, mesh: Path) -> MeshMeasures | None:
+def read_mesh_measures(folder: Path, mesh: Path, scale: float) -> MeshMeasures | None:
     """Return the measures in the folder of a built class; None if they are not those of the mesh.
 
     Args:
         folder: The folder of the class.
         mesh: The mesh file.
+        scale: Unit of its coordinates [m].
     """
     try:
         text = (folder / MEASURES_FILE).read_text(encoding="utf-8")
         measures = MeshMeasures.model_validate_json(text)
-        return measures if measures.sha256 == hash_mesh_file(mesh) else None
+        is_current = measures.sha256 == hash_mesh_file(mesh) and measures.scale == scale
+        return measures if is_current else None
     except (OSError, ValueError):
         return None
 

@@ -70,6 +70,19 @@ class PairArrangement(Enum):
     STANDING = "standing"
 
 
+class MeshUnit(Enum):
+    """Unit of the coordinates in a mesh file."""
+
+    METERS = "m"
+    CENTIMETERS = "cm"
+    MILLIMETERS = "mm"
+
+    @property
+    def scale(self) -> float:
+        """The unit [m]."""
+        return {"m": 1.0, "cm": 0.01, "mm": 0.001}[self.value]
+
+
 class LabelDesign(StrictModel):
     """How the texture of a class is drawn. Colors are sRGB hex strings.
 
@@ -107,8 +120,9 @@ class ClassEntry(StrictModel):
         source: Source of size and mass.
         pairs: Arrangements in which two objects of the class stand as a pair.
         only_rest: Only orientation at rest (cans stand, a marker lies); None if it varies.
-        mesh: Path of a closed mesh in meters, relative to the catalog; for shape mesh only. glTF
-            files are y up, all others z up.
+        mesh: Path of a closed mesh, relative to the catalog; for shape mesh only. glTF files are y
+            up, all others z up.
+        mesh_unit: Unit of the mesh's coordinates.
         label: How its texture is drawn.
     """
 
@@ -120,6 +134,7 @@ class ClassEntry(StrictModel):
     pairs: tuple[PairArrangement, ...] = ()
     only_rest: RestOrientation | None = None
     mesh: NonEmptyText | None = None
+    mesh_unit: MeshUnit = MeshUnit.METERS
     label: LabelDesign = LabelDesign()
 
     @field_validator("size_mm")
@@ -145,6 +160,8 @@ class ClassEntry(StrictModel):
             raise allowed_error(
                 "`mesh` and no `size_mm` for a mesh, `size_mm` and no `mesh` for others"
             )
+        if not is_mesh and "mesh_unit" in self.model_fields_set:
+            raise allowed_error("`mesh_unit` of a mesh alone; `size_mm` is in millimeters")
         return self
 
 
@@ -178,6 +195,7 @@ class ObjectClass:
         pairs: Pair arrangements for which the grammar has a rule.
         only_rest: Only orientation at rest; None if it varies.
         mesh: The user's mesh file, or None.
+        mesh_unit: Unit of its coordinates.
         label: How its texture is drawn.
         folder: Folder of its built assets.
     """
@@ -191,6 +209,7 @@ class ObjectClass:
     pairs: tuple[PairArrangement, ...]
     only_rest: RestOrientation | None
     mesh: Path | None
+    mesh_unit: MeshUnit
     label: LabelDesign
     folder: Path
 
@@ -288,12 +307,14 @@ class ObjectClass:
     def surface_triangles(self) -> NDArray[np.float64]:
         """Corners of the triangles of a mesh's surface in O [m]. Shape (F, 3, 3)."""
         assert self.mesh is not None, f"class {self.name} is not a mesh"
-        if read_mesh_measures(self.folder, self.mesh) is not None:
+        if read_mesh_measures(self.folder, self.mesh, self.mesh_unit.scale) is not None:
             surface = read_surface(self.folder)
             if surface is not None:
                 return surface
         where = f"{catalog_path(self.folder.parent)}: classes.{self.name}.mesh"
-        return np.asarray(load_object_mesh(self.mesh, where).solid.triangles, float)
+        return np.asarray(
+            load_object_mesh(self.mesh, where, self.mesh_unit.scale).solid.triangles, float
+        )
 
     @cached_property
     def corners(self) -> NDArray[np.float64]:
@@ -332,11 +353,12 @@ def _make_object_class(name: str, entry: ClassEntry, folder: Path, where: str) -
     """Return the class of an entry of a catalog."""
     mesh = folder / entry.mesh if entry.mesh else None
     if mesh is not None:
-        measures = read_mesh_measures(folder / name, mesh)
+        measures = read_mesh_measures(folder / name, mesh, entry.mesh_unit.scale)
         if measures is not None:
             size = measures.extents
         else:
-            extents = load_object_mesh(mesh, f"{where}.mesh").solid.extents
+            solid = load_object_mesh(mesh, f"{where}.mesh", entry.mesh_unit.scale).solid
+            extents = solid.extents
             size = (float(extents[0]), float(extents[1]), float(extents[2]))
     else:
         assert entry.size_mm is not None
@@ -362,6 +384,7 @@ def _make_object_class(name: str, entry: ClassEntry, folder: Path, where: str) -
         entry.pairs,
         entry.only_rest,
         mesh,
+        entry.mesh_unit,
         entry.label,
         folder / name,
     )

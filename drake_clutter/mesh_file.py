@@ -2,8 +2,8 @@
 
 A file may hold several bodies, and a body several parts with a material each. Vertices that are
 split at texture seams, at normals per face or between materials are merged for the solid; the
-parts keep them for the visual geometry. Coordinates in messages are those of the file [m]; of glTF
-files, they are those with z up.
+parts keep them for the visual geometry. Coordinates in messages are those of the file, converted to
+meters; of glTF files, they are those with z up.
 """
 
 # trimesh is typed in part only.
@@ -112,8 +112,8 @@ def format_point(point: Floats) -> str:
     return f"({', '.join(f'{value:.4g}' for value in point)})"
 
 
-def _read_parts(path: Path, where: str) -> list[tuple[str, trimesh.Trimesh]]:
-    """Return the names and meshes of the parts of a file, z up."""
+def _read_parts(path: Path, where: str, scale: float) -> list[tuple[str, trimesh.Trimesh]]:
+    """Return the names and meshes of the parts of a file, z up and in meters."""
     try:
         scene = trimesh.load_scene(path, process=False)
     except Exception as error:  # trimesh's readers raise whatever their formats suggest
@@ -127,6 +127,8 @@ def _read_parts(path: Path, where: str) -> list[tuple[str, trimesh.Trimesh]]:
             part.apply_transform(transform)
             if path.suffix.lower() in _GLTF_SUFFIXES:
                 part.apply_transform(Y_UP_TO_Z_UP)
+            if scale != 1:
+                part.vertices = np.asarray(part.vertices, float) * scale
             parts.append((str(node), part))
     if not parts:
         raise InputError(f"{where}: {path} cannot be read as a mesh (it has no triangles)")
@@ -144,11 +146,11 @@ def _check_extent(points: Floats, path: Path, where: str) -> None:
     extent = np.ptp(points, axis=0)
     if extent.min() >= MIN_EXTENT and extent.max() <= MAX_EXTENT:
         return
-    hint = "(units are meters)"
+    hint = "(see `mesh_unit`)"
     if extent.max() > MAX_EXTENT:
-        unit, factor = ("centimeters", 0.01) if extent.max() <= 30 else ("millimeters", 0.001)
+        unit, factor = ("cm", 0.01) if extent.max() <= 30 else ("mm", 0.001)
         if extent.max() * factor <= MAX_EXTENT:
-            hint = f"(units are meters; is it in {unit}? Scale it by {factor:g})"
+            hint = f"(is it in {unit}? Set `mesh_unit: {unit}` of the class)"
     elif extent.min() < _MIN_THICKNESS:
         hint = "; it is a flat surface without volume"
     x, y, z = extent
@@ -316,7 +318,7 @@ def _flipped(before: Ints, after: Ints) -> NDArray[np.bool_]:
     return np.asarray(~np.any(equal, axis=0))
 
 
-def load_object_mesh(path: Path, where: str) -> ObjectMesh:
+def load_object_mesh(path: Path, where: str, scale: float = 1.0) -> ObjectMesh:
     """Return a user's mesh as a closed solid and the parts that are seen.
 
     Vertices at one place are merged, and degenerate and repeated triangles removed. Bodies with
@@ -326,13 +328,14 @@ def load_object_mesh(path: Path, where: str) -> ObjectMesh:
     Args:
         path: The mesh file; glTF files are y up, all others z up.
         where: Field of the catalog, for error messages.
+        scale: Unit of the file's coordinates [m].
 
     Raises:
         InputError: The mesh cannot be read or has a defect. The message says which and where.
     """
     if not path.is_file():
         raise InputError(f"{where}: no file {path}; give a mesh that lies beside the catalog")
-    parts = _read_parts(path, where)
+    parts = _read_parts(path, where, scale)
     starts = np.cumsum([0] + [len(part.vertices) for _, part in parts[:-1]])
     points = np.vstack([np.asarray(part.vertices, float) for _, part in parts])
     triangles = np.vstack(

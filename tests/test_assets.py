@@ -298,7 +298,7 @@ def test_the_tray(tmp_path: Path) -> None:
 
 
 def test_the_builder_leaves_drake_s_reader_alone() -> None:
-    """The builder loads CoACD after Drake; otherwise Drake's SDF reader would throw."""
+    """CoACD is loaded in a process of its own; otherwise Drake's SDF reader would throw."""
     code = (
         "import drake_clutter.assets, drake_clutter.simulation.scene_plant as p; "
         "from pydrake.systems.framework import DiagramBuilder;"

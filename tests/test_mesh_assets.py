@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 from test_mesh_file import SIZE, write_cube_with_seams, write_two_materials
 from typer.testing import CliRunner
 
-from drake_clutter.assets import build_assets
+from drake_clutter.assets import build_assets, convex_pieces
 from drake_clutter.assets.convex_pieces import MAX_PIECE_CORNERS, measure_deviation
 from drake_clutter.built_mesh import read_mesh_measures
 from drake_clutter.catalog import ObjectClass, load_catalog
@@ -199,7 +199,7 @@ def test_a_ball_has_a_bounded_number_of_corners(tmp_path: Path) -> None:
     assert np.linalg.norm(corners, axis=1) == pytest.approx(radius, abs=1e-6)
     assert np.ptp(corners, axis=0) == pytest.approx(ball.size, abs=1e-6)
     assert ball.mesh is not None
-    measures = read_mesh_measures(ball.folder, ball.mesh)
+    measures = read_mesh_measures(ball.folder, ball.mesh, 1.0)
     assert measures is not None
     # The lowest plane of the hull is the deepest place of its surface.
     depth = radius + float(ConvexHull(corners).equations[:, 3].max())
@@ -256,3 +256,72 @@ def test_damaged_measures_of_a_mesh_are_not_used(tmp_path: Path, name: str) -> N
     own = load_catalog(tmp_path).classes["own"]
     assert own.size == pytest.approx((0.04, 0.05, 0.06))
     assert own.surface_triangles.shape == (12, 3, 3)
+
+
+def test_a_closed_cavity_is_filled(tmp_path: Path) -> None:
+    """A hollow bottle has the collision geometry of a solid one, and the mass of its wall."""
+    outer, inner = (
+        trimesh.creation.revolve(np.array(outline), sections=24)
+        for outline in (
+            [(0, 0), (0.035, 0), (0.035, 0.12), (0.014, 0.15), (0.014, 0.2), (0, 0.2)],
+            [(0, 0.003), (0.032, 0.003), (0.032, 0.118), (0.011, 0.15), (0.011, 0.197), (0, 0.197)],
+        )
+    )
+    solid = outer.volume
+    cavity = inner.volume
+    inner.invert()
+    trimesh.util.concatenate([outer, inner]).export(tmp_path / "bottle.stl")
+    bottle = own_class(tmp_path, "bottle.stl")
+    hulls = [trimesh.convex.convex_hull(corners) for corners in bottle.convex_pieces]
+    assert sum(hull.volume for hull in hulls) == pytest.approx(solid, rel=0.02)
+    expected = (solid * outer.center_mass[2] - cavity * inner.center_mass[2]) / (solid - cavity)
+    assert bottle.center_of_mass[2] == pytest.approx(expected - 0.1, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        (
+            "MAX_DECOMPOSITION_TIME",
+            0.01,
+            r"CoACD found no convex pieces within 0\.01 s; reduce its",
+        ),
+        (
+            "_COACD_OPTIONS",
+            {"no": 1},
+            r"CoACD failed with exit code 1 \(TypeError: .*\); reduce its",
+        ),
+    ],
+)
+def test_a_decomposition_that_fails_is_one_line(
+    name: str, value: Any, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(convex_pieces, name, value)
+    outline = [(0, 0), (0.06, 0), (0.07, 0.036), (0.066, 0.036), (0.056, 0.006), (0, 0.006)]
+    trimesh.creation.revolve(np.array(outline)).export(tmp_path / "bowl.stl")
+    with pytest.raises(InputError, match=rf"catalog\.yaml: classes\.own\.mesh: {message}"):
+        own_class(tmp_path, "bowl.stl")
+
+
+def test_a_mesh_in_millimeters_has_the_size_of_the_object(tmp_path: Path) -> None:
+    box = trimesh.creation.box(1000 * np.array(SIZE))
+    box.export(tmp_path / "box.obj")
+    text = "classes:\n  own: {shape: mesh, mesh: box.obj, mesh_unit: mm, mass_g: 120}\n"
+    (tmp_path / "catalog.yaml").write_text(text)
+    assert load_catalog(tmp_path).classes["own"].size == pytest.approx(SIZE)
+    build_assets(tmp_path)
+    load_catalog.cache_clear()
+    own = load_catalog(tmp_path).classes["own"]
+    assert own.size == pytest.approx(SIZE)
+    assert np.ptp(own.surface_triangles.reshape(-1, 3), axis=0) == pytest.approx(SIZE)
+    assert np.ptp(own.corners, axis=0) == pytest.approx(SIZE)
+    # The built measures are those of another unit, and are not used.
+    (tmp_path / "catalog.yaml").write_text(text.replace("unit: mm", "unit: m"))
+    load_catalog.cache_clear()
+    with pytest.raises(InputError, match=r"is it in mm\? Set `mesh_unit: mm` of the class"):
+        load_catalog(tmp_path)
+    (tmp_path / "catalog.yaml").write_text(
+        "classes:\n  own: {shape: box, size_mm: [9, 9, 9], mesh_unit: mm, mass_g: 120}\n"
+    )
+    with pytest.raises(InputError, match="`mesh_unit` of a mesh alone"):
+        load_catalog(tmp_path)

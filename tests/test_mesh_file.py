@@ -241,7 +241,7 @@ def test_vertices_that_are_not_finite_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("scale", "hint"),
-    [(1000, r"millimeters\? Scale it by 0\.001"), (100, r"centimeters\? Scale it by 0\.01")],
+    [(1000, r"in mm\? Set `mesh_unit: mm`"), (100, r"in cm\? Set `mesh_unit: cm`")],
 )
 def test_other_units_are_refused_with_a_hint(tmp_path: Path, scale: float, hint: str) -> None:
     refuse(trimesh.creation.box(np.array([0.1, 0.1, 0.2]) * scale), tmp_path, hint)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from test_settle import BELOW, MARKER_PAIR, STABLE, STANDING_PAIR
 from test_static_judge import ARCH, MARGIN, STATIC_JUDGE, TABLE, TOO_FAR, UPRIGHT
 
-from drake_clutter.catalog import ObjectClass, Shape
+from drake_clutter.catalog import MeshUnit, ObjectClass, Shape
 from drake_clutter.scenes.interfaces import InconclusiveVerdict
 from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
 
@@ -200,6 +200,7 @@ def block(name: str, shape: Shape, size: tuple[float, float, float], mass: float
         (),
         None,
         None,
+        MeshUnit.METERS,
         CLASSES["sugar_box"].label,
         Path("nowhere"),
     )

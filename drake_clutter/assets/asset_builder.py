@@ -205,7 +205,8 @@ def _load_checked_mesh(object_class: ObjectClass, repair: bool) -> ObjectMesh | 
     if object_class.mesh is None:
         return None
     where = f"{_mesh_where(object_class)}: {object_class.mesh}"
-    mesh = load_object_mesh(object_class.mesh, _mesh_where(object_class))
+    scale = object_class.mesh_unit.scale
+    mesh = load_object_mesh(object_class.mesh, _mesh_where(object_class), scale)
     if mesh.holes and not repair:
         raise InputError(
             f"{where}: is not watertight: {mesh.holes[0]}; "
@@ -229,7 +230,7 @@ def _make_asset_files(object_class: ObjectClass, object_mesh: ObjectMesh | None)
     """Return the contents of every file of a class, by file name."""
     mesh = object_mesh.solid if object_mesh is not None else None
     texture = draw_texture(object_class)
-    pieces = decompose_convex(mesh) if mesh is not None else []
+    pieces = decompose_convex(mesh, _mesh_where(object_class)) if mesh is not None else []
     files = {f"convex_{index:03d}.obj": obj_text(piece) for index, piece in enumerate(pieces)}
     if object_mesh is not None and object_class.mesh and has_appearance(object_mesh):
         parts = textured_parts(object_mesh, object_class.mesh)
@@ -248,6 +249,7 @@ def _make_asset_files(object_class: ObjectClass, object_mesh: ObjectMesh | None)
         max_bulge, max_recess = measure_deviation(object_mesh.solid, pieces)
         files[MEASURES_FILE] = MeshMeasures(
             sha256=hash_mesh_file(object_class.mesh),
+            scale=object_class.mesh_unit.scale,
             extents=(x, y, z),
             repairs=_repair_texts(object_mesh),
             max_bulge=max_bulge,
@@ -377,7 +379,9 @@ def describe_built_mesh(object_class: ObjectClass) -> tuple[str, ...]:
     """Return what a build repaired in the mesh of a class, and how its convex pieces deviate."""
     if object_class.mesh is None:
         return ()
-    measures = read_mesh_measures(object_class.folder, object_class.mesh)
+    measures = read_mesh_measures(
+        object_class.folder, object_class.mesh, object_class.mesh_unit.scale
+    )
     if measures is None:
         return ()
     counts = [len(piece) for piece in object_class.convex_pieces]

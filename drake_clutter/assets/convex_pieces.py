@@ -3,7 +3,12 @@
 # trimesh is typed in part only.
 # mypy: allow-untyped-calls
 
+import io
+import json
+import subprocess
+import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import trimesh
@@ -20,6 +25,7 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform
 from scipy.spatial import ConvexHull
 
+from drake_clutter.files import InputError
 from drake_clutter.mesh_file import is_flat
 
 Floats = NDArray[np.float64]
@@ -54,6 +60,9 @@ _COACD_OPTIONS = {
 
 With its default options, CoACD makes 48 pieces of the example's mug.
 """
+MAX_DECOMPOSITION_TIME = 300.0
+"""Largest time that CoACD may take for a body [s]; the example's mug takes 2 s."""
+_COACD_SCRIPT = Path(__file__).with_name("coacd_process.py")
 _NUM_EXACT_DISTANCES = 200
 """Number of vertices farthest outside of all pieces whose distance is computed exactly."""
 
@@ -124,27 +133,76 @@ def _is_convex(mesh: trimesh.Trimesh) -> bool:
     return bool(_excess(hull, points).min() > -max_dent)
 
 
-def decompose_convex(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
-    """Return convex hulls that cover a mesh; one for a convex mesh.
+def _outer_bodies(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
+    """Return the bodies of a mesh without its closed cavities, which nothing can touch."""
+    return [body for body in mesh.split(only_watertight=False) if body.volume > 0]
+
+
+def decompose_convex(mesh: trimesh.Trimesh, where: str) -> list[trimesh.Trimesh]:
+    """Return convex hulls that cover a mesh; one for each convex body.
 
     The decomposition is CoACD (Wei et al. 2022). Bodies are decomposed one by one, because CoACD
-    does not return for some meshes of separate bodies; a body with a cavity stays whole. Every hull
-    has at most `MAX_PIECE_CORNERS` corners.
-    """
-    bodies = list(mesh.split(only_watertight=False))
-    if len(bodies) > 1 and all(body.volume > 0 for body in bodies):
-        return [piece for body in bodies for piece in decompose_convex(body)]
-    if _is_convex(mesh):
-        return [bounded_hull(mesh.vertices)]
-    import coacd  # here, because it breaks Drake's SDF reader when loaded before Drake
+    does not return for some meshes of separate bodies. Closed cavities are filled. Every hull has
+    at most `MAX_PIECE_CORNERS` corners.
 
-    coacd.set_log_level("error")
-    pieces = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), **_COACD_OPTIONS)
-    low, high = mesh.bounds
-    # Clipped, because objects are stacked on the bounding box. A piece that is flat afterwards has
-    # no volume, and is left out.
-    clipped = [np.clip(vertices, low, high) for vertices, _ in pieces]
-    return [bounded_hull(points) for points in clipped if not is_flat(points)]
+    Args:
+        mesh: A closed mesh.
+        where: Field of the catalog, for error messages.
+
+    Raises:
+        InputError: CoACD fails, or does not return within `MAX_DECOMPOSITION_TIME`.
+    """
+    bodies = _outer_bodies(mesh)
+    pieces = list[trimesh.Trimesh]()
+    for number, body in enumerate(bodies, start=1):
+        if _is_convex(body):
+            pieces.append(bounded_hull(body.vertices))
+            continue
+        label = f"body {number} of {len(bodies)}: " if len(bodies) > 1 else ""
+        low, high = body.bounds
+        # Clipped, because objects are stacked on the bounding box. A piece that is flat afterwards
+        # has no volume, and is left out.
+        clipped = [np.clip(points, low, high) for points in _run_coacd(body, f"{where}: {label}")]
+        pieces += [bounded_hull(points) for points in clipped if not is_flat(points)]
+    return pieces
+
+
+def _run_coacd(body: trimesh.Trimesh, prefix: str) -> list[Floats]:
+    """Return the corners of the convex pieces that CoACD makes of a body [m]. Shapes (V, 3).
+
+    CoACD runs in a process of its own, because it cannot be interrupted, and because Drake's SDF
+    reader fails in a process that has loaded CoACD before Drake.
+
+    Args:
+        body: A closed mesh.
+        prefix: Start of error messages.
+    """
+    remedy = (
+        f"reduce its {len(body.faces)} triangles, and close gaps and deep recesses that no object "
+        "enters"
+    )
+    arrays = io.BytesIO()
+    np.savez(arrays, vertices=body.vertices, faces=body.faces)
+    command = [sys.executable, "-P", str(_COACD_SCRIPT), json.dumps(_COACD_OPTIONS)]
+    try:
+        run = subprocess.run(
+            command,
+            input=arrays.getvalue(),
+            capture_output=True,
+            timeout=MAX_DECOMPOSITION_TIME,
+            check=True,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise InputError(
+            f"{prefix}CoACD found no convex pieces within {MAX_DECOMPOSITION_TIME:g} s; {remedy}"
+        ) from error
+    except subprocess.CalledProcessError as error:
+        last_line = error.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+        raise InputError(
+            f"{prefix}CoACD failed with exit code {error.returncode} ({last_line}); {remedy}"
+        ) from error
+    with np.load(io.BytesIO(run.stdout)) as pieces:
+        return [np.asarray(corners, float) for corners in pieces.values()]
 
 
 def _distance_query(mesh: trimesh.Trimesh) -> tuple[SceneGraph, QueryObject]:
@@ -168,20 +226,21 @@ def measure_deviation(
     pieces, the recess at the vertices of the mesh.
 
     Args:
-        mesh: A closed mesh.
+        mesh: A closed mesh, whose cavities do not count.
         pieces: Convex pieces that cover it.
     """
-    _scene_graph, query = _distance_query(mesh)
+    outer: trimesh.Trimesh = trimesh.util.concatenate(_outer_bodies(mesh))  # type: ignore[assignment]
+    _scene_graph, query = _distance_query(outer)
     bulge = 0.0
-    recess = np.full(len(mesh.vertices), np.inf)
+    recess = np.full(len(outer.vertices), np.inf)
     for piece in pieces:
         edges = piece.vertices[piece.edges_unique].mean(axis=1)
         for point in np.vstack([piece.vertices, edges, piece.triangles_center]):
             bulge = max(bulge, query.ComputeSignedDistanceToPoint(point)[0].distance)
-        recess = np.minimum(recess, _excess(ConvexHull(piece.vertices), mesh.vertices))
+        recess = np.minimum(recess, _excess(ConvexHull(piece.vertices), outer.vertices))
     # The excess over planes is at most the distance, so the largest ones are computed exactly.
     farthest = np.argsort(recess)[-_NUM_EXACT_DISTANCES:]
-    outside = mesh.vertices[farthest[recess[farthest] > 0]]
+    outside = outer.vertices[farthest[recess[farthest] > 0]]
     triangles = np.vstack([piece.triangles for piece in pieces])
     distances = [
         np.linalg.norm(
