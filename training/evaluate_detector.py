@@ -36,7 +36,7 @@ from drake_clutter.simulation.camera_renderer import CameraRenderer
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.validation import to_plain
 from training.results_file import provenance
-from training.script import SeedOption, progress, run_script
+from training.script import CatalogOption, SeedOption, progress, run_script
 
 VISIBILITY_BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.01)
 """Bounds of the visible fractions for which recall is given separately."""
@@ -233,28 +233,29 @@ def main(
         ),
     ] = None,
     seed: SeedOption = 0,
+    catalog: CatalogOption = None,
     threads: Annotated[int, typer.Option(min=1, help="Threads of PyTorch.")] = 2,
 ) -> None:
     """Evaluate a detector, and print and write its metrics."""
     torch.set_num_threads(threads)
     config = ClutterConfig()
-    catalog = load_catalog()
+    all_classes = load_catalog(catalog)
     network = SegmentationNetwork.load(detector)
     camera = CameraRenderer(config.cell.camera)
     rows = dict[str, Any]()
     for path in scenes:
-        dataset = load_scene_dataset(path, catalog)
+        dataset = load_scene_dataset(path, all_classes)
         numbers = range(min(count, len(dataset.scenes)))
         rendered = [
             render_image(camera, dataset.settled_scene(k, dataset.grammar, config))
             for k in progress(numbers, path.stem)
         ]
         class_names = [c.name for c in dataset.classes]
-        rows[path.stem] = evaluate_images(network, class_names, rendered, catalog, seed)
+        rows[path.stem] = evaluate_images(network, class_names, rendered, all_classes, seed)
     if images is not None:
         image_dataset = ImageDataset(images)
         held_out = [image_dataset[k] for k in range(min(count, len(image_dataset)))]
-        rows["images"] = evaluate_images(network, network.classes, held_out, catalog, seed)
+        rows["images"] = evaluate_images(network, network.classes, held_out, all_classes, seed)
     write_json(
         out,
         {

@@ -25,7 +25,7 @@ from typing import Annotated, Any
 import typer
 
 from drake_clutter.agents.generators import GenerationJob, SceneGenerator
-from drake_clutter.catalog import load_catalog
+from drake_clutter.catalog import Catalog, load_catalog
 from drake_clutter.commands.generate_scenes import (
     PROGRESS_FILE,
     SCENES_FOLDER,
@@ -45,7 +45,7 @@ from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.tasks.generation_task import GenerationTaskConfig
 from drake_clutter.workers.parallel_map import map_ordered
 from training.results_file import provenance
-from training.script import SeedOption, WorkersOption, progress, run_script
+from training.script import CatalogOption, SeedOption, WorkersOption, progress, run_script
 
 MAX_GENERATED_PER_SCENE = 20
 """Number of scenes that are generated at most for each scene of the dataset."""
@@ -55,9 +55,8 @@ VERDICTS_FILE = "judged.jsonl"
 """Record file of a training set's verdicts, in the folder `--work`."""
 
 
-def read_stable_scenes(folder: Path) -> Iterator[SceneRecord]:
+def read_stable_scenes(folder: Path, catalog: Catalog) -> Iterator[SceneRecord]:
     """Yield the stable scenes with hidden objects of a folder that `generate` wrote."""
-    catalog = load_catalog()
     solvable = read_generation_progress(folder / PROGRESS_FILE).solvable
     for index, answer in enumerate(solvable):
         file = load_scene(folder / SCENES_FOLDER / f"{index:04d}.yaml", catalog)
@@ -86,7 +85,7 @@ class GraphJudge:
             job.config, margin=GenerationTaskConfig().contact_margin
         )
         self._drake_judge = DrakeJudge(job.config)
-        self._classes = load_catalog().classes
+        self._classes = load_catalog(job.catalog_folder).classes
 
     def __call__(self, index: int) -> dict[str, Any]:
         """Return the record of the scene of an index.
@@ -156,6 +155,7 @@ def main(
     ] = "sg-star",
     nodes: Annotated[int, typer.Option(min=3, help="Number of nodes of the scene graphs.")] = 25,
     objects: Annotated[str, typer.Option(help="Name of the object set.")] = "ycb7",
+    catalog: CatalogOption = None,
     count: Annotated[int, typer.Option(min=1, help="Number of scenes in the dataset.")] = 3000,
     seed: SeedOption = 0,
     temperature: Annotated[
@@ -174,9 +174,9 @@ def main(
     excluded_forms = {
         scene.canonical_form
         for path in exclude or []
-        for scene in load_scene_dataset(path, load_catalog()).scenes
+        for scene in load_scene_dataset(path, load_catalog(catalog)).scenes
     }
-    job = GenerationJob(agent, objects, None, nodes, seed, ClutterConfig(), temperature)
+    job = GenerationJob(agent, objects, catalog, nodes, seed, ClutterConfig(), temperature)
     metadata: dict[str, Any] = {
         "objects": objects,
         "agent": agent,
@@ -201,7 +201,9 @@ def main(
                 workers,
                 lambda items, done, total: progress(items, out.stem, total, done),
             )
-            scenes = list(drop_duplicates(read_stable_scenes(work), excluded_forms))
+            scenes = list(
+                drop_duplicates(read_stable_scenes(work, load_catalog(catalog)), excluded_forms)
+            )
     else:
         judge = partial(GraphJudge, job)
         records = resume_jsonl(

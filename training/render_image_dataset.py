@@ -61,7 +61,7 @@ from drake_clutter.simulation.camera_renderer import (
 from drake_clutter.simulation.drop import sample_drop_scene, simulate_drop
 from drake_clutter.validation import to_plain
 from drake_clutter.workers.parallel_map import map_ordered
-from training.script import SeedOption, WorkersOption, progress, run_script
+from training.script import CatalogOption, SeedOption, WorkersOption, progress, run_script
 
 JOB_FILE = "job.json"
 """File in the dataset's folder with what determines the images."""
@@ -92,11 +92,13 @@ class ImageJob:
 
     Attributes:
         objects: Name of the object set.
+        catalog: Asset folder with additional object classes, or None.
         heap_fraction: Fraction of the images that show heaps.
         seed: Seed of the dataset.
     """
 
     objects: str
+    catalog: Path | None
     heap_fraction: float
     seed: int
 
@@ -115,7 +117,7 @@ class ImageJob:
 
     def generators(self) -> list[tuple[str, str]]:
         """Return the generators that have no classes but the job's, each with its object set."""
-        catalog = load_catalog()
+        catalog = load_catalog(self.catalog)
         classes = set(catalog.object_set(self.objects))
         candidates = [(agent, objects or self.objects) for agent, objects in GENERATORS.items()]
         return [
@@ -138,7 +140,7 @@ class ItemRenderer:
         self._job = job
         self._out = out
         self._config = ClutterConfig()
-        self._classes = load_catalog().object_set(job.objects)
+        self._classes = load_catalog(job.catalog).object_set(job.objects)
         self._generators = dict[str, SceneGenerator]()
 
     def __call__(self, item: int) -> None:
@@ -154,7 +156,7 @@ class ItemRenderer:
             self._out / TRAIN_FOLDER / f"{item:06d}",
             images,
             self._config.cell.camera,
-            list(load_catalog().classes),
+            list(load_catalog(self._job.catalog).classes),
         )
         # The process can abort when another thread collects the renderer.
         del camera
@@ -182,7 +184,9 @@ class ItemRenderer:
         generators = self._job.generators()
         agent, objects = generators[rng.integers(len(generators))]
         if agent not in self._generators:
-            job = GenerationJob(agent, objects, None, NODES, self._job.seed, self._config)
+            job = GenerationJob(
+                agent, objects, self._job.catalog, NODES, self._job.seed, self._config
+            )
             self._generators[agent] = SceneGenerator(job)
         scene, _ = self._generators[agent].lay_out(rng)
         yield scene
@@ -346,6 +350,7 @@ def check_job(out: Path, job_fields: dict[str, Any]) -> None:
         return
     earlier = json.loads(path.read_text())
     earlier = {_EARLIER_JOB_FIELDS.get(key, key): value for key, value in earlier.items()}
+    earlier = {"catalog": None, **earlier}  # Version 0.1 rendered shipped objects alone.
     if earlier != job_fields:
         raise InputError(
             f"--out {out}: holds images of another job; expected a folder that is new or of the"
@@ -369,16 +374,17 @@ def main(
     seed: SeedOption = 0,
     workers: WorkersOption = 1,
     objects: Annotated[str, typer.Option(help="Name of the object set.")] = "pantry14",
+    catalog: CatalogOption = None,
 ) -> None:
     """Render a dataset of labeled images."""
-    job = ImageJob(objects, heap_fraction, seed)
+    job = ImageJob(objects, catalog.resolve() if catalog else None, heap_fraction, seed)
     job_fields = {**to_plain(job), "agents": [agent for agent, _ in job.generators()]}
     shared_entries = {JOB_FILE, TRAIN_FOLDER, DATASET_CAMERA_FILE, MODELS_FOLDER}
     prepare_output_directory(out, allowed_entries=frozenset(shared_entries))
     check_job(out, job_fields)
     write_json(out / JOB_FILE, job_fields)
     write_dataset_camera(out, ClutterConfig().cell.camera)
-    write_models(out, list(load_catalog().classes.values()))
+    write_models(out, list(load_catalog(job.catalog).classes.values()))
     (out / TRAIN_FOLDER).mkdir(exist_ok=True)
     present = {path.name for path in (out / TRAIN_FOLDER).iterdir()}
     num_items = num_images = 0

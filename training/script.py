@@ -6,6 +6,7 @@ A script is a module with a function `main` of typed options and, at its end,
         run_script(main)
 """
 
+import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -37,6 +38,10 @@ SettingsOption = Annotated[
         "--set", metavar="FIELD=VALUE", help="Set a field, over the file's. May be repeated."
     ),
 ]
+CatalogOption = Annotated[
+    Path | None,
+    typer.Option("--catalog", metavar="DIR", help="Asset folder with your own object classes."),
+]
 ResultsOption = Annotated[
     Path | None, typer.Option("--out", metavar="FILE", help="Results file to write (JSON).")
 ]
@@ -47,6 +52,17 @@ SeedOption = Annotated[
     int,
     typer.Option("--seed", min=0, max=MAX_SEED, help="Seed. The same seed gives the same results."),
 ]
+
+
+def settings_with_catalog(settings: Sequence[str] | None, catalog: Path | None) -> list[str]:
+    """Return the settings of a configuration, with its field `catalog` set by `--catalog`.
+
+    Args:
+        settings: Settings `FIELD=VALUE`.
+        catalog: The asset folder; None keeps the field.
+    """
+    folder = [] if catalog is None else [f"catalog={json.dumps(str(catalog))}"]
+    return [*folder, *(settings or [])]
 
 
 def run_script(*commands: Callable[..., None]) -> None:

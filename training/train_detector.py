@@ -38,7 +38,13 @@ from drake_clutter.validation import (
     load_config_as,
     renamed_fields,
 )
-from training.script import ConfigOption, SettingsOption, run_script
+from training.script import (
+    CatalogOption,
+    ConfigOption,
+    SettingsOption,
+    run_script,
+    settings_with_catalog,
+)
 from training.training_loop import DeviceOption, Metrics, OutOption, train_to_end
 
 CHECKPOINT = "detector.safetensors"
@@ -138,15 +144,18 @@ def main(
     out: OutOption,
     config: ConfigOption = None,
     settings: SettingsOption = None,
+    catalog: CatalogOption = None,
     device: DeviceOption = "auto",
     threads: Annotated[int, typer.Option(min=1, help="Threads of PyTorch on a CPU.")] = 2,
 ) -> None:
     """Train a detector and write detector.safetensors."""
-    training = load_config_as(CONFIG, config, settings or [], upgrade_config)
+    training = load_config_as(
+        CONFIG, config, settings_with_catalog(settings, catalog), upgrade_config
+    )
     torch.set_num_threads(threads)
     torch_device = resolve_device(device)
-    catalog = load_catalog(Path(training.catalog) if training.catalog else None)
-    classes = [c.name for c in catalog.object_set(training.objects)]
+    all_classes = load_catalog(Path(training.catalog) if training.catalog else None)
+    classes = [c.name for c in all_classes.object_set(training.objects)]
     images = ImageDataset(Path(training.images))
     num_training_images = len(images) - training.held_out
     if num_training_images < 1:

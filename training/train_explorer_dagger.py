@@ -20,7 +20,13 @@ from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import resolve_device
 from drake_clutter.validation import Count, config_class, load_config_as
 from training.explorer_loop import train_explorer
-from training.script import ConfigOption, SettingsOption, run_script
+from training.script import (
+    CatalogOption,
+    ConfigOption,
+    SettingsOption,
+    run_script,
+    settings_with_catalog,
+)
 from training.training_loop import DeviceOption, OutOption
 
 
@@ -47,10 +53,13 @@ def main(
     out: OutOption,
     config: ConfigOption = None,
     settings: SettingsOption = None,
+    catalog: CatalogOption = None,
     device: DeviceOption = "auto",
 ) -> None:
     """Train a student by cloning a teacher and write explorer.safetensors."""
-    training = load_config_as(CONFIG, config, settings or [], upgrade_config)
+    training = load_config_as(
+        CONFIG, config, settings_with_catalog(settings, catalog), upgrade_config
+    )
     limit_operations_to_one_thread()
     torch_device = resolve_device(device)
     environment = training.make_environment()

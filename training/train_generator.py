@@ -47,7 +47,13 @@ from drake_clutter.validation import (
     load_config_as,
     renamed_fields,
 )
-from training.script import ConfigOption, SettingsOption, run_script
+from training.script import (
+    CatalogOption,
+    ConfigOption,
+    SettingsOption,
+    run_script,
+    settings_with_catalog,
+)
 from training.training_loop import DeviceOption, Metrics, OutOption, train_to_end
 
 CHECKPOINT = "generator.safetensors"
@@ -118,6 +124,7 @@ def main(
     out: OutOption,
     config: ConfigOption = None,
     settings: SettingsOption = None,
+    catalog: CatalogOption = None,
     device: DeviceOption = "auto",
     threads: Annotated[
         int,
@@ -127,11 +134,13 @@ def main(
     ] = NUM_GRADIENT_SHARDS,
 ) -> None:
     """Train a scene generator and write generator.safetensors."""
-    training = load_config_as(CONFIG, config, settings or [], upgrade_config)
+    training = load_config_as(
+        CONFIG, config, settings_with_catalog(settings, catalog), upgrade_config
+    )
     torch_device = resolve_device(device)
     limit_operations_to_one_thread()
-    catalog = load_catalog(Path(training.catalog) if training.catalog else None)
-    classes = catalog.object_set(training.objects)
+    all_classes = load_catalog(Path(training.catalog) if training.catalog else None)
+    classes = all_classes.object_set(training.objects)
     learning = training.learning
 
     def make_environment() -> ClutterGeneration:
