@@ -80,6 +80,10 @@ def tray(side: float) -> Support:
     return DEFAULT_CELL.support.model_copy(update={"size": (side, side)})
 
 
+ONE_CUP = "gripper.cup_diameter=0.025"
+"""Setting that leaves the default cell its large cup, on which no marker seals."""
+
+
 def cell_with(*settings: str) -> WorkCell:
     """Return the default cell with changed fields, such as "robot.base.x=-0.8"."""
     return load_config_as(DEFAULT_CELL, settings=settings)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import DEFAULT_CELL, cell_with, executed, resting, rng, scene_of
+from conftest import DEFAULT_CELL, ONE_CUP, cell_with, executed, resting, rng, scene_of
 from pydrake.systems.analysis import Simulator
 
 from drake_clutter.assets import build_assets
@@ -81,6 +81,26 @@ def test_a_weld_grasp_does_not_slip(plan: PickPlacePlan) -> None:
     result = run(plan, weld=WeldPair(plan.pick, plan.tool))
     assert result.grasped
     assert result.slip < 1e-9
+
+
+def test_the_small_cup_moves_a_marker_between_others() -> None:
+    """Markers lie 2 mm apart; the vacuum of the large cup stays off."""
+    markers = [
+        resting("large_marker", xy=(0.0, y), name=name)
+        for name, y in (("left", 0.02), ("middle", 0.0), ("right", -0.02))
+    ]
+    place = markers[1].X_TO.translated((0.1, -0.2, 0.001))
+    plan = PickPlacePlanner(DEFAULT_CELL, PlannerConfig()).plan(markers, "middle", place)
+    assert isinstance(plan, PickPlacePlan)
+    assert plan.tool == "small"
+    simulation = StationSimulation(DEFAULT_CELL, scene_of(*markers))
+    result = simulation.execute(plan, record=True)
+    assert result.grasped
+    assert not result.lost_object
+    assert result.position_error < 0.003
+    assert max(result.displacements.values()) < 0.001
+    assert {sample.arm.tool for sample in result.motion if sample.arm} == {"", "small"}
+    assert simulation.gripper.status.tool == "small"
 
 
 def test_an_object_is_dropped_if_the_vacuum_is_too_weak(plan: PickPlacePlan) -> None:
@@ -240,13 +260,14 @@ def test_simulation_is_deterministic(plan: PickPlacePlan) -> None:
 def test_moves_are_executed_or_refused_with_a_reason(
     detector: LabelDetector, config: ClutterConfig
 ) -> None:
-    """A box is placed; a marker and a box that carries another one are refused."""
+    """A large cup places a box; it refuses a marker and a box that carries another one."""
     scene = scene_of(
         resting("pudding_box"),
         resting("gelatin_box", floor=0.035),
         resting("large_marker", xy=(0.2, 0.2)),
     )
-    executor, observation = ArmExecutor(config), detector.perceive(scene).observation
+    one_cup = replace(config, cell=cell_with(ONE_CUP))
+    executor, observation = ArmExecutor(one_cup), detector.perceive(scene).observation
     placed = executed(executor, scene, observation, Move("gelatin_box"), rng())
     assert placed.result is MoveResult.PLACED
     assert placed.instability is None

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import DEFAULT_CELL, resting, rng, scene_of
+from conftest import DEFAULT_CELL, ONE_CUP, cell_with, resting, rng, scene_of
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
@@ -214,7 +214,8 @@ def test_each_request_is_planned_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_closed_loop_episode(config: ClutterConfig, tmp_path: Path) -> None:
-    """The marker cannot be grasped; moving the upper box reveals the lower one."""
+    """A large cup holds no marker; moving the upper box reveals the lower one."""
+    config = replace(config, cell=cell_with(ONE_CUP))
     scene = Scene((*COVERED.objects, resting("large_marker", xy=(-0.2, -0.2))), COVERED.support)
     names = list[str]()
 
@@ -336,7 +337,8 @@ def test_without_a_guarded_descent_objects_are_released_at_the_placement_pose(
 
 
 def test_infeasible_moves_are_invalid_for_the_policy(config: ClutterConfig) -> None:
-    """The marker cannot be grasped, the box supports it, and neither has room for the can."""
+    """A large cup holds no marker, the box supports it, and neither has room for the can."""
+    config = replace(config, cell=cell_with(ONE_CUP))
     beliefs = list[Belief]()
 
     def policy(belief: Belief, observation: Observation, rng: np.random.Generator) -> Decision:

@@ -10,7 +10,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from conftest import DEFAULT_CELL, cell_with, resting, rng, scene_of
+from conftest import DEFAULT_CELL, ONE_CUP, cell_with, resting, rng, scene_of
 from typer.testing import CliRunner
 
 from drake_clutter.cell.work_cell import WorkCell
@@ -64,7 +64,7 @@ def test_manipulability_in_closed_form() -> None:
 
 
 def test_every_legal_move_has_a_row() -> None:
-    rows = study().plan_all_moves("scene", 0, SCENE)
+    rows = study(cell_with(ONE_CUP)).plan_all_moves("scene", 0, SCENE)
     by_pick: dict[str, list[str]] = {}
     for row in rows:
         by_pick.setdefault(row.pick, []).append(row.result)
@@ -76,7 +76,8 @@ def test_every_legal_move_has_a_row() -> None:
         assert math.isfinite(row.motion_s) == (row.result == PLANNED)
         assert math.isfinite(row.place_x) == (row.result != "no free spot")
         assert row.num_below == (1 if row.pick == "gelatin_box" else 0)
-    again = study().plan_all_moves("scene", 0, SCENE)
+        assert row.tool == ("single" if row.result == PLANNED else "")
+    again = study(cell_with(ONE_CUP)).plan_all_moves("scene", 0, SCENE)
     assert [str(replace(row, planning_s=0.0)) for row in rows] == [
         str(replace(row, planning_s=0.0)) for row in again
     ]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import resting, scene_of, training_script
+from conftest import ONE_CUP, resting, scene_of, training_script, world_with
 
 from drake_clutter.agents.explorers import largest_clear
 from drake_clutter.config import ClutterConfig
@@ -141,8 +141,8 @@ def test_recorded_episodes_are_not_repeated(
 
 
 def test_objects_below_an_ungraspable_one_are_unrevealable() -> None:
-    """No cup can hold the marker on the upper box, so the lower box stays hidden."""
-    ceiling = ArmReachabilityBound(ClutterConfig())
+    """The large cup cannot hold the marker on the upper box, so the lower box stays hidden."""
+    ceiling = ArmReachabilityBound(world_with(f"cell.{ONE_CUP}"))
     on_top = resting("large_marker", xy=(0.05, 0.0), floor=0.028 + 0.06)
     assert ceiling.find_unrevealable(COVERED) == ()
     above = replace(
@@ -154,3 +154,6 @@ def test_objects_below_an_ungraspable_one_are_unrevealable() -> None:
     assert ceiling.find_unrevealable(replace(COVERED, objects=(*COVERED.objects, above))) == (
         "gelatin_box",
     )
+    with_small_cup = ArmReachabilityBound(ClutterConfig())
+    marked = replace(COVERED, objects=(*COVERED.objects, above))
+    assert with_small_cup.find_unrevealable(marked) == ()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import CLASSES, DEFAULT_CELL, cell_with, random_scene, resting, rng
+from conftest import CLASSES, DEFAULT_CELL, ONE_CUP, cell_with, random_scene, resting, rng
 
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.grammar import Orientation
@@ -127,9 +127,9 @@ def reason(found: PickPlacePlan | PlanningFailure) -> PlanningFailureReason:
     return found.reason
 
 
-def test_a_marker_does_not_seal() -> None:
+def test_a_marker_does_not_seal_on_a_large_cup() -> None:
     marker = SceneObject("marker", CLASSES["large_marker"], Pose((0.0, 0.0, 0.009), LYING))
-    found = planner().plan([marker], "marker", Pose((0.1, 0.1, 0.01), LYING))
+    found = planner(cell_with(ONE_CUP)).plan([marker], "marker", Pose((0.1, 0.1, 0.01), LYING))
     assert reason(found) is PlanningFailureReason.NO_SEAL
     assert isinstance(found, PlanningFailure)
     assert found.value > DEFAULT_CELL.gripper.unevenness

@@ -146,10 +146,24 @@ def test_the_default_cup_is_the_widest_that_seals_on_all_objects() -> None:
     ]
 
 
-def test_a_marker_cannot_be_grasped() -> None:
+def test_only_small_cups_follow_a_marker() -> None:
+    """The sagitta of a marker of radius 9 mm is r - sqrt(r^2 - d^2 / 4)."""
     side = RigidTransform(ALONG_MINUS_X, [0.009, 0.0, 0.0])
-    for diameter in (0.010, 0.015, 0.025, 0.040):
-        assert lip_flatness_deviation(CLASSES["large_marker"], side, diameter) > SUCTION.unevenness
+    for diameter in (0.005, 0.006, 0.008, 0.010, 0.015):
+        sagitta = 0.009 - math.sqrt(0.009**2 - diameter**2 / 4)
+        deviation = lip_flatness_deviation(CLASSES["large_marker"], side, diameter)
+        assert deviation == pytest.approx(sagitta, abs=1.5e-4)  # of a prism of 32 sides
+        assert (deviation <= SUCTION.unevenness) is (diameter <= 0.008)
+
+
+def test_the_cup_is_chosen_by_what_seals_and_holds() -> None:
+    """A large cup cannot follow the marker; the small one cannot bear the box."""
+    gripper = DEFAULT_CELL.gripper
+    for name, tools in (("large_marker", {"small"}), ("cracker_box", {"large"})):
+        o = resting(name)
+        grasps = gripper.sample_grasps(o.object_class, rigid_transform(o.X_TO), SAMPLING)
+        assert not isinstance(grasps, GraspFailure)
+        assert {grasp.tool for grasp in grasps} == tools
 
 
 def test_the_holding_force_is_pressure_times_area() -> None:
