@@ -27,6 +27,7 @@ from drake_clutter.cell.work_cell import default_cell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import write_json
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.planning.motion_limits import MotionLimits
 from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.segment_planner import INFLUENCE_DISTANCE, MAX_REPORTED_DISTANCE
@@ -349,6 +350,7 @@ def timing(
     executor = ArmExecutor(CONFIG)
     unoptimized = ArmExecutor(CONFIG, planner_config=PlannerConfig(optimize=False))
     stopwatch = Stopwatch()
+    unloaded = MotionLimits(default_cell(), Payload())
 
     def measure_move(number: int) -> bool:
         """Measure the move of a number; return whether there is a plan."""
@@ -391,7 +393,7 @@ def timing(
         )
         stopwatch.measure(
             "timing of a path without load",
-            lambda: parameterize_time_optimal(bspline_path(q), default_cell(), Payload()),
+            lambda: parameterize_time_optimal(bspline_path(q), unloaded),
         )
         simulation = stopwatch.measure(
             "simulation, built", lambda: StationSimulation(default_cell(), scene)

@@ -4,20 +4,28 @@ import math
 
 import numpy as np
 import pytest
-from conftest import DEFAULT_CELL, rng
+from conftest import DEFAULT_CELL, cell_with, rng
+from pydrake.math import BsplineBasis, KnotVectorType
 from pydrake.multibody.optimization import Toppra
-from pydrake.trajectories import PathParameterizedTrajectory, PiecewisePolynomial, Trajectory
+from pydrake.trajectories import BsplineTrajectory, Trajectory
 
 from drake_clutter.cell.gripper import Payload
+from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.planning.arm_dynamics import arm_dynamics, dynamics_plant
+from drake_clutter.planning.motion_limits import (
+    LimitKind,
+    LimitViolation,
+    MotionLimits,
+    scale_to_limits,
+    to_scipy,
+)
 from drake_clutter.planning.time_parameterization import (
-    LIMIT_FRACTION,
+    SMOOTHING_TIME,
     bspline_path,
-    dynamics_plant,
-    inverse_dynamics,
     linear_joint_path,
     parameterize_time_optimal,
+    path_speed_problem,
     sample_path,
-    scale_to_limits,
 )
 from drake_clutter.robots.robot_model import load_robot
 
@@ -55,90 +63,136 @@ def test_a_bspline_path_keeps_its_ends_and_blends_corners() -> None:
     assert 0.005 < aside.min() < 0.08
 
 
-def limit_ratios(trajectory: Trajectory, payload: Payload) -> dict[str, float]:
-    """Return the largest ratio to each limit at 1,500 samples of a trajectory."""
-    times = np.linspace(0.0, trajectory.end_time(), 1500)
-    q = np.array([trajectory.value(t).ravel() for t in times])
-    v, a = (
-        np.array([trajectory.EvalDerivative(t, order).ravel() for t in times]) for order in (1, 2)
-    )
-    torque = inverse_dynamics(dynamics_plant(ARM, payload), q, v, a)
-    pairs = {
-        "speed": v / ROBOT.velocity_limits,
-        "acceleration": a / ROBOT.acceleration_limits,
-        "torque": torque / ROBOT.torque_limits,
-    }
+def limit_ratios(
+    trajectory: Trajectory, payload: Payload, cell: WorkCell = ARM
+) -> dict[str, float]:
+    """Return the largest ratio to each limit at 500 Hz."""
+    robot = load_robot(cell.robot)
+    times = np.linspace(0.0, trajectory.end_time(), math.ceil(500 * trajectory.end_time()) + 1)
+    q, v, a, jerk = (trajectory.MakeDerivative(order).vector_values(times).T for order in range(4))
+    lower, upper = robot.position_limits.T
+    torque = arm_dynamics(cell, payload).inverse_dynamics(q, v, a)
     X_FL = np.eye(4)
     X_FL[:3, 3] = payload.p_FCm
-    of_load = (
-        np.diff((ROBOT.forward_kinematics(q) @ X_FL)[:, :3, 3], 2, axis=0)
-        / (times[1] - times[0]) ** 2
-    )
-    pairs["hold"] = np.linalg.norm(of_load, axis=1) / payload.max_acceleration
+    X_BF = robot.forward_kinematics(q)
+    p_BL = (X_BF @ X_FL)[:, :3, 3]
+    tools = [tool.X_FG.GetAsMatrix4() for tool in cell.gripper.tools.values()]
+    p_BG = np.array([(X_BF @ X_FG)[:, :3, 3] for X_FG in tools])
+    step = times[1] - times[0]
+    of_load = np.linalg.norm(np.diff(p_BL, 2, axis=0), axis=1) / step**2
+    of_tool = np.linalg.norm(np.diff(p_BG, axis=1), axis=2) / step
+    pairs = {
+        "position": (2 * q - lower - upper) / (upper - lower),
+        "speed": v / robot.velocity_limits,
+        "acceleration": a / robot.acceleration_limits,
+        "jerk": jerk / robot.jerk_limits,
+        "torque": torque / robot.torque_limits,
+        "load": of_load / payload.max_acceleration,
+        "tool speed": of_tool / (cell.robot.tool_speed or math.inf),
+    }
     return {name: float(np.abs(share).max()) for name, share in pairs.items()}
 
 
-@pytest.mark.parametrize("payload", [Payload(), Payload(0.5, (0.0, 0.0, 0.3223), 1.5)])
-def test_trajectories_satisfy_the_limits(payload: Payload) -> None:
+def corner_path(generator: np.random.Generator) -> BsplineTrajectory:
+    """Return a path with a corner."""
+    via, end = (HOME + generator.uniform(-0.8, 0.8, 6) for _ in range(2))
+    return bspline_path(np.vstack([linear_joint_path(HOME, via), linear_joint_path(via, end)[1:]]))
+
+
+def parameterize(
+    path: BsplineTrajectory, payload: Payload, cell: WorkCell = ARM
+) -> BsplineTrajectory:
+    trajectory = parameterize_time_optimal(path, MotionLimits(cell, payload))
+    assert isinstance(trajectory, BsplineTrajectory), str(trajectory)
+    return trajectory
+
+
+LOADED = Payload(0.5, (0.0, 0.0, 0.3223), 1.5)
+SLOW_TOOL = cell_with("robot.tool_speed=0.25")
+WEAK = cell_with("robot.limits.torque=[30, 50, 55, 6, 1.6, 0.1]")
+
+
+@pytest.mark.parametrize(
+    ("cell", "payload", "active"),
+    [
+        (ARM, Payload(), ""),
+        (ARM, LOADED, "load"),
+        (SLOW_TOOL, Payload(), "tool speed"),
+        (WEAK, Payload(), "torque"),
+    ],
+)
+def test_trajectories_satisfy_the_limits(cell: WorkCell, payload: Payload, active: str) -> None:
     generator = rng(0)
-    for _ in range(3):
-        via, end = (HOME + generator.uniform(-0.8, 0.8, 6) for _ in range(2))
-        trajectory = parameterize_time_optimal(
-            bspline_path(
-                np.vstack([linear_joint_path(HOME, via), linear_joint_path(via, end)[1:]])
-            ),
-            ARM,
-            payload,
-        )
-        assert trajectory is not None
-        ratios = limit_ratios(trajectory, payload)
-        assert max(ratios.values()) < 1.01, ratios
-        assert np.abs(trajectory.EvalDerivative(0.0, 1)).max() < 1e-3
+    for _ in range(2):
+        path = corner_path(generator)
+        trajectory = parameterize(path, payload, cell)
+        ratios = limit_ratios(trajectory, payload, cell)
+        assert max(ratios.values()) < 1.002, ratios
+        assert not active or ratios[active] > 0.7, ratios
+        for time, s in ((0.0, 0.0), (trajectory.end_time(), 1.0)):
+            assert trajectory.value(time) == pytest.approx(path.value(s), abs=1e-12)
+            for order in (1, 2):
+                assert np.abs(trajectory.EvalDerivative(time, order)).max() < 1e-9
+        # The trajectory follows the path.
+        on_path = path.vector_values(np.linspace(0.0, 1.0, 2000)).T
+        for q in trajectory.vector_values(np.linspace(0.0, trajectory.end_time(), 50)).T:
+            assert np.abs(on_path - q).max(axis=1).min() < 2e-3
 
 
-@pytest.mark.parametrize("payload", [Payload(), Payload(0.5, (0.0, 0.0, 0.3223), 1.5)])
+def test_limits_that_no_speed_satisfies_are_named() -> None:
+    path = corner_path(rng(0))
+    weak = cell_with("robot.limits.torque=[330, 25, 150, 56, 56, 56]")
+    violation = parameterize_time_optimal(path, MotionLimits(weak, Payload()))
+    assert isinstance(violation, LimitViolation)
+    assert (violation.kind, violation.joint) == (LimitKind.TORQUE, ROBOT.joint_names[1])
+    assert str(violation) == f"torque of {ROBOT.joint_names[1]}"
+
+    beyond = np.array([HOME, HOME + 0.5, np.where(np.arange(6) == 2, 6.6, HOME)])
+    violation = parameterize_time_optimal(bspline_path(beyond), MotionLimits(ARM, Payload()))
+    assert isinstance(violation, LimitViolation)
+    assert (violation.kind, violation.joint) == (LimitKind.POSITION, ROBOT.joint_names[2])
+    assert violation.ratio == pytest.approx(6.6 / (2 * math.pi))
+
+
+@pytest.mark.parametrize("payload", [Payload(), LOADED])
 def test_a_trajectory_is_scaled_until_one_limit_is_active(payload: Payload) -> None:
-    path = bspline_path(linear_joint_path(HOME, HOME + np.array([0.8, -0.4, 0.5, 0.3, 0.0, 0.2])))
-    too_fast = PathParameterizedTrajectory(
-        path, PiecewisePolynomial.CubicHermite([0.0, 0.3], [[0.0, 1.0]], [[0.0, 0.0]])
-    )
-    found = scale_to_limits(too_fast, ARM, payload)
-    assert found is not None
-    assert 0.95 < max(limit_ratios(found, payload).values()) < 1.01
-    assert found.value(found.end_time()) == pytest.approx(too_fast.value(0.3))
-    again = scale_to_limits(found, ARM, payload)
-    assert again is not None
-    assert again.end_time() == pytest.approx(found.end_time(), rel=0.01), (
-        "as it is, if the limits hold"
-    )
+    end = HOME + np.array([0.8, -0.4, 0.5, 0.3, 0.0, 0.2])
+    points = np.vstack([[HOME] * 3, linear_joint_path(HOME, end), [end] * 3])
+    basis = BsplineBasis(4, len(points), KnotVectorType.kClampedUniform, 0.0, 0.3)
+    too_fast = BsplineTrajectory(basis, points.T)
+    limits = MotionLimits(ARM, payload)
+    found = scale_to_limits(too_fast, limits)
+    assert isinstance(found, BsplineTrajectory)
+    assert 0.99 < max(limit_ratios(found, payload).values()) < 1.002
+    assert found.value(found.end_time()).ravel() == pytest.approx(end)
+    assert found.value(found.end_time() / 2) == pytest.approx(too_fast.value(0.15))
+    assert scale_to_limits(found, limits) is found, "as it is, if the limits hold"
 
 
-def test_durations_equal_those_of_drakes_toppra() -> None:
+def test_time_optimal_durations_equal_those_of_drakes_toppra() -> None:
     generator = rng(1)
+    unlimited_jerk = cell_with("robot.limits.jerk=null")
     for _ in range(3):
-        via, end = (HOME + generator.uniform(-0.8, 0.8, 6) for _ in range(2))
-        path = bspline_path(
-            np.vstack([linear_joint_path(HOME, via), linear_joint_path(via, end)[1:]])
-        )
+        path = corner_path(generator)
         toppra = Toppra(path, dynamics_plant(ARM, Payload()), np.linspace(0.0, 1.0, 300))
-        toppra.AddJointVelocityLimit(
-            -LIMIT_FRACTION * ROBOT.velocity_limits, LIMIT_FRACTION * ROBOT.velocity_limits
-        )
-        toppra.AddJointAccelerationLimit(
-            -LIMIT_FRACTION * ROBOT.acceleration_limits, LIMIT_FRACTION * ROBOT.acceleration_limits
-        )
-        found = parameterize_time_optimal(path, ARM, Payload())
-        assert found is not None
-        assert found.end_time() == pytest.approx(
-            toppra.SolvePathParameterization().end_time(), rel=0.01
-        )
+        toppra.AddJointVelocityLimit(-ROBOT.velocity_limits, ROBOT.velocity_limits)
+        toppra.AddJointAccelerationLimit(-ROBOT.acceleration_limits, ROBOT.acceleration_limits)
+        problem = path_speed_problem(to_scipy(path), MotionLimits(unlimited_jerk, Payload()))
+        speeds = problem.time_optimal_speeds()
+        duration = (2 * np.diff(problem.grid) / (speeds[1:] + speeds[:-1])).sum()
+        assert duration == pytest.approx(toppra.SolvePathParameterization().end_time(), rel=0.01)
 
 
-def test_the_duration_of_a_long_path_follows_from_the_velocity_limit() -> None:
-    """On a long path the shoulder moves at its velocity limit, 120 deg/s, most of the time."""
+def test_a_joint_moves_nearly_as_fast_as_its_limits_allow() -> None:
+    """Compare with the time-optimal motion of one joint under the same limits.
+
+    Its duration is d / v + v / a + a / j if velocity and acceleration reach their limits.
+    """
     waypoints = linear_joint_path(HOME, HOME + np.array([2.5, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    trajectory = parameterize_time_optimal(bspline_path(waypoints), ARM, Payload())
-    assert trajectory is not None
-    cruise = 2.5 / (0.97 * ROBOT.velocity_limits[0])
-    starts = ROBOT.velocity_limits[0] / ROBOT.acceleration_limits[0]
-    assert cruise + 0.8 * starts < trajectory.end_time() < cruise + 1.3 * starts
+    trajectory = parameterize(bspline_path(waypoints), Payload())
+    v, a, j = (
+        limits[0]
+        for limits in (ROBOT.velocity_limits, ROBOT.acceleration_limits, ROBOT.jerk_limits)
+    )
+    optimum = 2.5 / v + v / a + a / j
+    assert optimum < trajectory.end_time() < optimum + SMOOTHING_TIME

@@ -50,6 +50,7 @@ class RobotSpec(StrictModel):
         home: Configuration in which moves start and end, and in which the arm does not occlude the
             support [rad].
         limits: Limits of the joints.
+        tool_speed: Largest speed of the tools' origins in planned motions [m/s]; None for no limit.
         ik: Inverse kinematics: `ur` for the closed form of the UR family, or `numerical`.
         payload: Largest mass of gripper and object together [kg].
         pedestal_side: Side of the square pedestal between table and base [m]; 0 for no pedestal.
@@ -61,6 +62,7 @@ class RobotSpec(StrictModel):
     base: PoseSpec
     home: Annotated[tuple[Finite, ...], Field(min_length=1)]
     limits: JointLimits
+    tool_speed: Positive | None = None
     ik: Literal["ur", "numerical"] = "numerical"
     payload: Positive
     pedestal_side: Annotated[float, InRange(0.0, 1.0)] = 0.0

@@ -197,7 +197,7 @@ class SuctionGripper(StrictModel):
                 # The horizontal offset of the load depends on the yaw, and is neglected.
                 p_GCm = (0.0, 0.0, round(float(p_GCm[2]), 2))
                 a, b, c = (cup.X_FG.transform @ np.array(p_GCm)).tolist()
-                payload = Payload(object_class.mass, (a, b, c), round(acceleration, 1))
+                payload = Payload(object_class.mass, (a, b, c), acceleration)
                 grasps.append(Grasp(cup.name, X_TG, payload))
                 if len(grasps) == sampling.max_grasps:
                     break

@@ -21,7 +21,7 @@ from drake_clutter.planning.collision_model import SignedDistance
 from drake_clutter.scenes.scene import Pose
 
 DESCENT_SPEED = 0.02
-"""Speed of a guarded descent [m/s]: 0.5 mm between two contact checks of the executor."""
+"""Largest speed of a guarded descent [m/s]: 0.5 mm between two contact checks of the executor."""
 
 
 class PlanningFailureReason(Enum):
@@ -115,6 +115,28 @@ class TrajectorySegment:
 
 
 @dataclass(frozen=True)
+class GuardedDescent:
+    """Vertical descent of the gripper from the place pose, from rest to rest.
+
+    Attributes:
+        trajectory: Joint positions over time. Shape (n,).
+        depth: Lowered distance over time [m]. Shape (1,).
+    """
+
+    trajectory: Trajectory
+    depth: Trajectory
+
+    @property
+    def duration(self) -> float:
+        """Duration if no contact occurs [s]."""
+        return float(self.trajectory.end_time())
+
+    def depth_at(self, time: float) -> float:
+        """Return the lowered distance at a time [s], which is limited to the descent [m]."""
+        return float(self.depth.value(min(time, self.duration))[0, 0])
+
+
+@dataclass(frozen=True)
 class PickPlacePlan:
     """Trajectories that pick an object and place it at another pose.
 
@@ -129,9 +151,8 @@ class PickPlacePlan:
         num_attempts: Number of combinations of grasp, inverse kinematics solution and transfer
             height that were tried.
         planning_time: Wall time spent [s].
-        guarded_descent: Joint positions over time, shape (n,), that lower the gripper vertically
-            from the place pose at `DESCENT_SPEED`. The executor stops it at contact. None without
-            guarded descent.
+        guarded_descent: Descent from the place pose at `DESCENT_SPEED`, which the executor stops at
+            contact. None without guarded descent.
     """
 
     pick: str
@@ -143,7 +164,7 @@ class PickPlacePlan:
     segments: tuple[TrajectorySegment, ...]
     num_attempts: int
     planning_time: float
-    guarded_descent: Trajectory | None = None
+    guarded_descent: GuardedDescent | None = None
 
     @property
     def duration(self) -> float:
@@ -155,7 +176,7 @@ class PickPlacePlan:
         """Distance of the guarded descent if no contact occurs [m]."""
         if self.guarded_descent is None:
             return 0.0
-        return DESCENT_SPEED * float(self.guarded_descent.end_time())
+        return self.guarded_descent.depth_at(self.guarded_descent.duration)
 
     @property
     def unoptimized_duration(self) -> float:

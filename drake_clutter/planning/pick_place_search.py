@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from drake_clutter.cell.gripper import Grasp
+from drake_clutter.cell.gripper import Grasp, Payload
 from drake_clutter.cell.support_sdf import FLOOR
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.collision_model import CollisionModel
@@ -183,6 +183,13 @@ class PickPlaceSearch:
             for candidate in self.ik_candidates(grasp)
         )
 
+    def _load(self, candidate: GraspCandidate) -> Payload:
+        """Return the load of a grasp with the center of mass at its yaw."""
+        X_FG = self._cell.gripper.tools[candidate.tool].X_FG
+        p_GCm = candidate.X_OG.inverse() @ self._picked.object_class.center_of_mass
+        x, y, z = (X_FG @ p_GCm).tolist()
+        return replace(candidate.payload, p_FCm=(x, y, z))
+
     def plan_candidate(self, candidate: GraspCandidate) -> PickPlacePlan | None:
         """Return a plan with one of the `ik_candidates` at the lowest feasible height.
 
@@ -193,6 +200,7 @@ class PickPlaceSearch:
             The plan, or None after recording a failure.
         """
         self.num_attempts += 1
+        candidate = replace(candidate, payload=self._load(candidate))
         pick = self._pick_endpoint(candidate)
         if pick is None:
             return None
@@ -233,16 +241,13 @@ class PickPlaceSearch:
         place: EndpointContext,
         q_place: Floats,
     ) -> PickPlacePlan:
-        X_FG = self._cell.gripper.tools[candidate.tool].X_FG
-        p_GCm = candidate.X_OG.inverse() @ self._picked.object_class.center_of_mass
-        x, y, z = (X_FG @ p_GCm).tolist()
         return PickPlacePlan(
             pick=self._picked.name,
             X_TO_pick=self._picked.X_TO,
             X_TO_place=self._X_TO_goal,
             tool=candidate.tool,
             X_OG=candidate.X_OG,
-            payload=replace(candidate.payload, p_FCm=(x, y, z)),
+            payload=candidate.payload,
             segments=segments,
             num_attempts=self.num_attempts,
             planning_time=0.0,

@@ -17,9 +17,11 @@ from pydrake.trajectories import PiecewisePolynomial, Trajectory
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.collision_model import CollisionModel, SignedDistance
+from drake_clutter.planning.motion_limits import LimitViolation, MotionLimits, scale_to_limits
 from drake_clutter.planning.pick_place_plan import (
     DESCENT_SPEED,
     FailureLog,
+    GuardedDescent,
     PlanningFailureReason,
     TrajectorySegment,
 )
@@ -29,7 +31,6 @@ from drake_clutter.planning.time_parameterization import (
     bspline_path,
     parameterize_time_optimal,
     sample_path,
-    scale_to_limits,
 )
 from drake_clutter.planning.tool_kinematics import CarryPath, ToolKinematics, raise_pose
 from drake_clutter.planning.trajectory_optimization import (
@@ -276,9 +277,14 @@ class SegmentPlanner:
         min_distance = self._check_segment(name, path, candidate, endpoints, progress)
         if min_distance is None:
             return None
-        trajectory = parameterize_time_optimal(path, self._cell, payload)
-        if trajectory is None:
-            self._failures.record(progress, PlanningFailureReason.TRAJECTORY_INFEASIBLE, name)
+        trajectory = parameterize_time_optimal(path, MotionLimits(self._cell, payload))
+        if isinstance(trajectory, LimitViolation):
+            self._failures.record(
+                progress,
+                PlanningFailureReason.TRAJECTORY_INFEASIBLE,
+                f"{name}: {trajectory}",
+                trajectory.ratio,
+            )
             return None
         return TrajectorySegment(name, trajectory, min_distance, trajectory.end_time())
 
@@ -378,20 +384,27 @@ class SegmentPlanner:
                     linearized.append(LinearizedDistance(gradient, distance.distance - required))
             return linearized
 
+        limits = MotionLimits(self._cell, payload)
         problem = TrajectoryOptimizationProblem(
             initial_trajectory=segment.trajectory,
             robot=self._robot,
             vertical_start=segment.name != "approach",
             vertical_end=segment.name != "retreat",
             keep_tool_vertical=is_carry,
+            max_tool_speed=limits.max_tool_speed,
             max_tool_acceleration=payload.max_axis_acceleration,
             nearby_distances=nearby_distances,
             tool_jacobian=partial(self._collision_model.tool_jacobian, candidate.tool),
             tool_axis=self._tools[candidate.tool].axis,
         )
         optimized = optimize_trajectory(problem)
-        trajectory = scale_to_limits(optimized, self._cell, payload) if optimized else None
-        if trajectory is None or trajectory.end_time() >= segment.unoptimized_duration:
+        if optimized is None:
+            return segment
+        trajectory = scale_to_limits(optimized, limits)
+        if (
+            isinstance(trajectory, LimitViolation)
+            or trajectory.end_time() >= segment.unoptimized_duration
+        ):
             return segment
         # Optimized paths pass obstacles closely: the check is denser than that of the initial path.
         closest = self._check_segment(
@@ -403,7 +416,7 @@ class SegmentPlanner:
 
     def plan_guarded_descent(
         self, candidate: GraspCandidate, place: EndpointContext, q_place: Floats
-    ) -> Trajectory | None:
+    ) -> GuardedDescent | None:
         """Return the vertical descent from the place pose as far as the arm is free.
 
         The attached object is ignored: it is expected to touch something.
@@ -435,6 +448,11 @@ class SegmentPlanner:
             path.append(step[1])
         if len(path) == 1:
             return None
-        return PiecewisePolynomial.FirstOrderHold(
-            heights[: len(path)] / DESCENT_SPEED, np.array(path).T
-        )
+        limits = MotionLimits(self._cell, candidate.payload, DESCENT_SPEED)
+        trajectory = parameterize_time_optimal(bspline_path(np.array(path)), limits)
+        if isinstance(trajectory, LimitViolation):
+            return None
+        times = np.linspace(0.0, trajectory.end_time(), 10 * len(path))
+        heights = self._tools[candidate.tool].pose(trajectory.vector_values(times).T)[:, 2, 3]
+        depth = PiecewisePolynomial.FirstOrderHold(times, (heights[0] - heights)[None])
+        return GuardedDescent(trajectory, depth)

@@ -1,68 +1,54 @@
 """Time parameterization: from joint-space waypoints to feasible trajectories.
 
-Frames: B is the robot's base, F is the flange, Cm is the load's center of mass.
+Frames: B is the robot's base, F is the flange, G is the gripper, Cm is the load's center of mass.
 """
 
 import math
-from functools import lru_cache
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import BsplineBasis, KnotVectorType, RigidTransform
-from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import MultibodyForces, SpatialInertia, UnitInertia
-from pydrake.systems.framework import Context
-from pydrake.trajectories import (
-    BsplineTrajectory,
-    PathParameterizedTrajectory,
-    PiecewisePolynomial,
-    Trajectory,
-)
+from pydrake.math import BsplineBasis, KnotVectorType
+from pydrake.trajectories import BsplineTrajectory, Trajectory
+from scipy.interpolate import BSpline, CubicHermiteSpline
+from scipy.ndimage import maximum_filter1d
 
-from drake_clutter.cell.gripper import Payload
-from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.planning.motion_limits import (
+    LIMIT_TOLERANCE,
+    LimitViolation,
+    MotionLimits,
+    MotionSamples,
+    scale_to_limits,
+    time_scales,
+    to_scipy,
+)
 from drake_clutter.planning.toppra import solve_toppra
-from drake_clutter.robots.robot_model import RobotModel, load_robot
-from drake_clutter.robots.robot_plant import add_robot
+from drake_clutter.robots.robot_model import RobotModel
 
 Floats = NDArray[np.float64]
 
-LIMIT_FRACTION = 0.97
-"""Fraction of the joint limits that is used. Limits are imposed at grid points; a trajectory may
-exceed them slightly in between."""
 MAX_JOINT_STEP = 0.08
 """Largest change of a joint between neighboring waypoints of a path [rad]; it also bounds the
 rotation of the gripper between neighboring poses."""
 SMOOTHING_TIME = 0.1
-"""Width of the moving average of `smooth_time_scaling` [s]: the period at which 0.5 kg oscillates
-on the bellows of the default suction cup (2000 N/m)."""
+"""Width of the moving average of `smooth_time_scaling` [s]. It is the period at which 0.5 kg
+oscillates on the bellows of the default suction cup (2000 N/m), and twice the time in which the
+jerk limits of the cells of `models/` allow the full acceleration, so that the acceleration may
+change its sign at once."""
+SPLINE_PERIOD = 0.005
+"""Time between the knots of a trajectory [s]. Between its control points, which lie on the path, a
+spline passes at a sixth of their second difference: 0.04 mrad at 10 rad/s^2."""
 _SPLINE_ORDER = 4
 """Order of the B-splines: cubic, so that accelerations are continuous."""
 _NUM_GRID_POINTS = 300
 """Points of a path at which limits are imposed."""
-
-
-@lru_cache(maxsize=64)
-def _cached_dynamics_plant(
-    cell: WorkCell, mass: float, p_FCm: tuple[float, float, float]
-) -> MultibodyPlant:
-    plant = MultibodyPlant(0.0)
-    robot = add_robot(plant, load_robot(cell.robot), visuals=False)
-    (tool,) = Parser(plant).AddModelsFromString(cell.gripper.model_sdf(compliant=False), "sdf")
-    flange = plant.GetFrameByName(cell.robot.tool_frame, robot)
-    plant.WeldFrames(flange, plant.GetFrameByName("body", tool))
-    if mass:
-        inertia = SpatialInertia(mass, np.zeros(3), UnitInertia.SolidSphere(0.05))
-        load = plant.AddRigidBody("load", robot, inertia)
-        plant.WeldFrames(flange, load.body_frame(), RigidTransform(list(p_FCm)))
-    plant.Finalize()
-    return plant
-
-
-def dynamics_plant(cell: WorkCell, payload: Payload) -> MultibodyPlant:
-    """Return a plant of arm, rigid gripper and load alone."""
-    return _cached_dynamics_plant(cell, payload.mass, payload.p_FCm)
+_NUM_ROUNDS = 3
+"""Largest number of solutions of TOPP-RA with smaller and smaller limits."""
+_MAX_SLOWDOWN = 1.25
+"""Largest factor by which a round slows a part of the path down."""
+_MAX_SQUARED_SPEED = 1e6
+"""Upper bound of the squared speed of the path parameter [1/s^2]; keeps paths of no length finite.
+"""
 
 
 def min_travel_time(displacements: Floats, robot: RobotModel) -> Floats:
@@ -141,136 +127,44 @@ def sample_path(path: Trajectory, spacing: float = MAX_JOINT_STEP / 2) -> Floats
 
 
 def parameterize_time_optimal(
-    path: Trajectory, cell: WorkCell, payload: Payload
-) -> Trajectory | None:
-    """Return the time-optimal trajectory along a path from rest to rest.
+    path: BsplineTrajectory, limits: MotionLimits
+) -> BsplineTrajectory | LimitViolation:
+    """Return a nearly time-optimal trajectory along a path, at rest with zero acceleration at ends.
 
-    Limits: joint velocity, acceleration and torque, and the acceleration at which the gripper
-    holds the payload. With a payload, `smooth_time_scaling` is applied.
+    TOPP-RA finds the time-optimal speeds with steps of the acceleration. Their moving average over
+    `SMOOTHING_TIME` bounds the jerk, and shifts accelerations along the path: where a limit is
+    exceeded then, the next round has smaller limits. The trajectory is a uniform B-spline over
+    time whose control points lie on the path, so that it satisfies the limits of velocity,
+    acceleration and jerk also between its knots. `scale_to_limits` checks the fastest one.
 
     Args:
-        path: Path in joint space.
-        cell: Work cell with robot and gripper.
-        payload: Load of the gripper.
+        path: Path in joint space with the parameter s in [0, 1].
+        limits: Limits of the motion.
 
     Returns:
-        The trajectory, or None if the limits cannot be satisfied.
+        The trajectory, or the limit that it exceeds at any speed.
     """
-    plant = dynamics_plant(cell, payload)
-    robot = load_robot(cell.robot)
-    torque_limits = LIMIT_FRACTION * robot.torque_limits
-    grid = np.linspace(path.start_time(), path.end_time(), _NUM_GRID_POINTS)
-    derivative = path.MakeDerivative(1)
-    q = path.vector_values(grid).T
-    dq_ds = derivative.vector_values(grid).T
-    d2q_ds2 = derivative.MakeDerivative(1).vector_values(grid).T
-    with np.errstate(divide="ignore"):
-        speed_ratios = LIMIT_FRACTION * robot.velocity_limits / np.abs(dq_ds)
-        max_squared_speeds = (speed_ratios**2).min(axis=1)
-    # Rows (a, b, lower, upper) of lower <= a u + b x <= upper, see `toppra`.
-    limits = np.broadcast_to(LIMIT_FRACTION * robot.acceleration_limits, dq_ds.shape)
-    rows = [(dq_ds, d2q_ds2, -limits, limits)]
-    if math.isfinite(payload.max_acceleration):
-        p_BCm = (robot.forward_kinematics(q) @ np.array([*payload.p_FCm, 1.0]))[:, :3]
-        limits = np.full(p_BCm.shape, payload.max_axis_acceleration)
-        dp_ds = np.gradient(p_BCm, grid, axis=0, edge_order=2)
-        rows.append((dp_ds, np.gradient(dp_ds, grid, axis=0, edge_order=2), -limits, limits))
-
-    def solve() -> Trajectory | None:
-        a, b, lower, upper = (np.hstack(column) for column in zip(*rows, strict=True))
-        x = solve_toppra(grid[1] - grid[0], a, b, lower, upper, max_squared_speeds)
-        speed = np.sqrt(x)
-        if not (speed[1:-1] > 0).all():
-            return None
-        times = np.concatenate([[0.0], np.cumsum(2 * np.diff(grid) / (speed[1:] + speed[:-1]))])
-        scaling = PiecewisePolynomial.CubicHermite(times, grid[None], speed[None])
-        return PathParameterizedTrajectory(
-            path, smooth_time_scaling(scaling) if payload.mass else scaling
-        )
-
-    # Torque limits are rarely active and dominate the computation time: without them first.
-    trajectory = solve()
-    if trajectory is None:
-        return None
-    torques = inverse_dynamics(plant, *sample_motion(trajectory, 40))
-    if (np.abs(torques) <= torque_limits).all():
-        return trajectory
-    rest = np.zeros_like(q)
-    gravity = inverse_dynamics(plant, q, rest, rest)
-    if (np.abs(gravity) > torque_limits).any():
-        return None
-    rows.append(
-        (
-            inverse_dynamics(plant, q, rest, dq_ds) - gravity,
-            inverse_dynamics(plant, q, dq_ds, d2q_ds2) - gravity,
-            -torque_limits - gravity,
-            torque_limits - gravity,
-        )
-    )
-    return solve()
-
-
-def smooth_time_scaling(time_scaling: Trajectory) -> Trajectory:
-    """Return a time scaling averaged over `SMOOTHING_TIME`; its duration increases.
-
-    Accelerations then change continuously. A step of the acceleration would excite an oscillation
-    of the load on the elastic cup with twice the static deflection.
-
-    Args:
-        time_scaling: Path parameter over time. Shape (1,).
-    """
-    step = 0.005
-    half_width = round(SMOOTHING_TIME / 0.01)
-    last = math.ceil(time_scaling.end_time() / step) + 2 * half_width
-    times = np.arange(-2 * half_width, last + 1) * step
-    values = time_scaling.vector_values(np.clip(times, 0.0, time_scaling.end_time())).ravel()
-    width = 2 * half_width + 1
-    mean = np.convolve(values, np.full(width, 1 / width), mode="valid")
-    zero = np.zeros((1, 1))
-    return PiecewisePolynomial.CubicWithContinuousSecondDerivatives(
-        np.arange(len(mean)) * step, mean[None], zero, zero
-    )
-
-
-def scale_to_limits(trajectory: Trajectory, cell: WorkCell, payload: Payload) -> Trajectory | None:
-    """Return a trajectory slowed down uniformly until it satisfies the limits.
-
-    The limits are those of `parameterize_time_optimal`.
-
-    Args:
-        trajectory: Joint positions over time.
-        cell: Work cell with robot and gripper.
-        payload: Load of the gripper.
-
-    Returns:
-        The trajectory, or None if the limits cannot be satisfied at any speed.
-    """
-    plant = dynamics_plant(cell, payload)
-    robot = load_robot(cell.robot)
-    end_time = trajectory.end_time()
-    count = max(200, math.ceil(end_time / 0.005))
-    q, v, a = sample_motion(trajectory, count)
-    gravity = inverse_dynamics(plant, q, np.zeros_like(q), np.zeros_like(q))
-    dynamic = inverse_dynamics(plant, q, v, a) - gravity
-    torque_reserve = LIMIT_FRACTION * robot.torque_limits - np.sign(dynamic) * gravity
-    if (torque_reserve <= 0).any():
-        return None
-    # Accelerations and dynamic torques are inversely proportional to the squared time scale.
-    squared_scale = (np.abs(v) / robot.velocity_limits / LIMIT_FRACTION).max() ** 2
-    squared_scale = max(
-        squared_scale, (np.abs(a) / robot.acceleration_limits / LIMIT_FRACTION).max()
-    )
-    squared_scale = max(squared_scale, (np.abs(dynamic) / torque_reserve).max())
-    if math.isfinite(payload.max_acceleration):
-        p_BCm = (robot.forward_kinematics(q) @ np.array([*payload.p_FCm, 1.0]))[:, :3]
-        accelerations = np.diff(p_BCm, 2, axis=0) / (end_time / (count - 1)) ** 2
-        squared_scale = max(
-            squared_scale, np.linalg.norm(accelerations, axis=1).max() / payload.max_acceleration
-        )
-    scale = max(1.0, math.sqrt(squared_scale))
-    return PathParameterizedTrajectory(
-        trajectory, PiecewisePolynomial.FirstOrderHold([0.0, scale * end_time], [[0.0, end_time]])
-    )
+    spline = to_scipy(path)
+    problem = path_speed_problem(spline, limits)
+    squared_scales = np.ones(_NUM_GRID_POINTS)
+    shortest, best = math.inf, path
+    for _ in range(_NUM_ROUNDS):
+        s = smooth_time_scaling(problem.grid, problem.time_optimal_speeds(squared_scales))
+        points = spline(s)
+        scales = time_scales(limits.ratios(_samples_at_knots(points)))
+        scale = float(scales.max())
+        if not math.isfinite(scale):
+            return scale_to_limits(_uniform_bspline(points), limits)
+        duration = max(scale, 1.0) * len(points)
+        if duration < shortest:
+            shortest, best = duration, _uniform_bspline(points)
+        if scale <= 1 + LIMIT_TOLERANCE:
+            break
+        # The smoothing mixes accelerations within half its width on either side.
+        width = 1 + round(SMOOTHING_TIME / SPLINE_PERIOD)
+        widened = np.minimum(maximum_filter1d(np.maximum(scales, 1.0), width), _MAX_SLOWDOWN)
+        squared_scales *= np.interp(problem.grid, s[1:-1], widened) ** 2
+    return scale_to_limits(best, limits)
 
 
 def sample_motion(trajectory: Trajectory, count: int) -> tuple[Floats, Floats, Floats]:
@@ -288,29 +182,124 @@ def sample_motion(trajectory: Trajectory, count: int) -> tuple[Floats, Floats, F
     return trajectory.vector_values(times).T, v, a
 
 
-@lru_cache(maxsize=64)
-def _cached_context(plant: MultibodyPlant) -> Context:
-    return plant.CreateDefaultContext()
+@dataclass(frozen=True)
+class PathSpeedProblem:
+    """Limits of the speed along a path, at grid points of its parameter s.
+
+    Attributes:
+        grid: Uniform grid points. Shape (m,).
+        a: Coefficients of the acceleration of s in the limited accelerations. Shape (m, rows).
+        b: Coefficients of the squared speed of s. Shape (m, rows).
+        bounds: Limits of the absolute accelerations. Shape (m, rows).
+        max_squared_speeds: Upper bounds of the squared speed of s. Shape (m,).
+    """
+
+    grid: Floats
+    a: Floats
+    b: Floats
+    bounds: Floats
+    max_squared_speeds: Floats
+
+    def time_optimal_speeds(self, squared_scales: Floats | float = 1.0) -> Floats:
+        """Return the time-optimal speeds of s from rest to rest. Shape (m,).
+
+        Args:
+            squared_scales: Squared factors by which each point is slowed down. Shape (m,).
+        """
+        bounds = self.bounds / np.reshape(squared_scales, (-1, 1))
+        squared_speeds = solve_toppra(
+            self.grid[1] - self.grid[0],
+            self.a,
+            self.b,
+            -bounds,
+            bounds,
+            self.max_squared_speeds / squared_scales,
+        )
+        return np.sqrt(squared_speeds)
 
 
-def inverse_dynamics(plant: MultibodyPlant, q: Floats, v: Floats, a: Floats) -> Floats:
-    """Return the joint torques of a motion.
+def path_speed_problem(path: BSpline, limits: MotionLimits) -> PathSpeedProblem:
+    """Return the limits of the speed along a path, without those of jerk and torque.
 
     Args:
-        plant: Plant of `dynamics_plant`.
-        q: Positions [rad]. Shape (m, n).
-        v: Velocities [rad/s]. Shape (m, n).
-        a: Accelerations [rad/s^2]. Shape (m, n).
+        path: Path in joint space with the parameter s in [0, 1].
+        limits: Limits of the motion.
+    """
+    robot = limits.robot
+    grid = np.linspace(0.0, 1.0, _NUM_GRID_POINTS)
+    q, dq_ds, d2q_ds2 = (path(grid, order) for order in range(3))
+    X_BF = robot.forward_kinematics(q)
+    rows = [(dq_ds, d2q_ds2, robot.acceleration_limits)]
+    if math.isfinite(limits.payload.max_acceleration):
+        p_BCm = X_BF[:, :3, :3] @ limits.p_FC[0] + X_BF[:, :3, 3]
+        dp_ds = np.gradient(p_BCm, grid, axis=0, edge_order=2)
+        d2p_ds2 = np.gradient(dp_ds, grid, axis=0, edge_order=2)
+        rows.append((dp_ds, d2p_ds2, np.full(3, limits.payload.max_axis_acceleration)))
+    a, b, bounds = (
+        np.hstack([np.broadcast_to(row[k], row[0].shape) for row in rows]) for k in range(3)
+    )
+    with np.errstate(divide="ignore"):
+        max_speeds = (robot.velocity_limits / np.abs(dq_ds)).min(axis=1)
+    if math.isfinite(limits.max_tool_speed):
+        p_BG = limits.p_FC[1:] @ X_BF[:, :3, :3].transpose(0, 2, 1) + X_BF[:, None, :3, 3]
+        dp_ds = np.gradient(p_BG, grid, axis=0, edge_order=2)
+        tool_speeds = np.linalg.norm(dp_ds, axis=2).max(axis=1)
+        max_speeds = np.minimum(max_speeds, limits.max_tool_speed / np.maximum(tool_speeds, 1e-12))
+    d3q_ds3 = path(np.minimum(grid, 1 - 1e-9), 3)
+    with np.errstate(divide="ignore"):
+        max_speeds = np.minimum(
+            max_speeds, np.cbrt(robot.jerk_limits / np.abs(d3q_ds3)).min(axis=1)
+        )
+    max_squared_speeds = np.minimum(max_speeds**2, _MAX_SQUARED_SPEED)
+    return PathSpeedProblem(grid, a, b, bounds, max_squared_speeds)
+
+
+def smooth_time_scaling(grid: Floats, speeds: Floats) -> Floats:
+    """Return control points of a time scaling, averaged over `SMOOTHING_TIME`.
+
+    They are the control points of a uniform cubic B-spline over time with knots `SPLINE_PERIOD`
+    apart. Three equal ones at either end give zero speed and acceleration.
+
+    Args:
+        grid: Grid points of the path parameter s. Shape (m,).
+        speeds: Speeds of s, zero at the ends, with constant accelerations in between. Shape (m,).
 
     Returns:
-        Torques [N m]. Shape (m, n).
+        Values of s. Shape (k,).
     """
-    context = _cached_context(plant)
-    forces = MultibodyForces(plant)
-    torques = np.empty_like(q)
-    for k in range(len(q)):
-        plant.SetPositions(context, q[k])
-        plant.SetVelocities(context, v[k])
-        plant.CalcForceElementsContribution(context, forces)
-        torques[k] = plant.CalcInverseDynamics(context, a[k], forces)
-    return torques
+    times = np.concatenate([[0.0], np.cumsum(2 * np.diff(grid) / (speeds[1:] + speeds[:-1]))])
+    integral = CubicHermiteSpline(times, grid, speeds).antiderivative()
+    half_width = SMOOTHING_TIME / 2
+    count = math.ceil((times[-1] + SMOOTHING_TIME) / SPLINE_PERIOD) + 5
+    centers = (np.arange(count) - 2) * SPLINE_PERIOD - half_width
+
+    def integrate(t: Floats) -> Floats:
+        """Return the integral of s until t, where s stays at its ends before and after."""
+        after = np.maximum(t - times[-1], 0.0) * grid[-1]
+        return np.asarray(integral(np.clip(t, 0.0, times[-1])) + after)
+
+    mean = (integrate(centers + half_width) - integrate(centers - half_width)) / SMOOTHING_TIME
+    return np.asarray(np.clip(mean, grid[0], grid[-1]))
+
+
+def _uniform_bspline(points: Floats) -> BsplineTrajectory:
+    """Return the uniform B-spline with knots `SPLINE_PERIOD` apart. Shape of the points (k, n)."""
+    duration = SPLINE_PERIOD * (len(points) - _SPLINE_ORDER + 1)
+    basis = BsplineBasis(_SPLINE_ORDER, len(points), KnotVectorType.kUniform, 0.0, duration)
+    return BsplineTrajectory(basis, points.T)
+
+
+def _samples_at_knots(points: Floats) -> MotionSamples:
+    """Return the motion of a uniform B-spline at its knots, the jerk of the steeper neighbor.
+
+    Args:
+        points: Control points. Shape (k, n).
+
+    Returns:
+        Samples of length k - 2.
+    """
+    v = (points[2:] - points[:-2]) / (2 * SPLINE_PERIOD)
+    a = np.diff(points, 2, axis=0) / SPLINE_PERIOD**2
+    jerk = np.abs(np.diff(a, axis=0)) / SPLINE_PERIOD
+    jerk = np.maximum(np.vstack([jerk[:1], jerk]), np.vstack([jerk, jerk[-1:]]))
+    return MotionSamples((points[:-2] + 4 * points[1:-1] + points[2:]) / 6, v, a, jerk)

@@ -1,15 +1,17 @@
 """Minimum-time trajectory optimization by sequential convex programming.
 
-A cubic B-spline in joint space is optimized for minimum duration T under limits of joint velocity,
-joint acceleration and tool acceleration, and under signed-distance constraints. Signed distances
+A cubic B-spline in joint space is optimized for minimum duration T under limits of velocity,
+acceleration and jerk of the joints, speed and acceleration of the tool, and under signed-distance
+constraints. Signed distances
 are linear in the joint positions for small steps, and so in the control points of the spline. Each
 convex subproblem linearizes them at the previous solution, and a trust region bounds the change of
 the control points (Schulman et al. 2014, "Motion planning with sequential convex optimization and
 convex collision checking").
 
 The variables are the control points over the parameter s in [0, 1], and T^2. The limits are linear
-in these: q'' is bounded by a_max T^2, and q' by v_max T. The square root T of T^2 is replaced by
-its tangent at the previous solution, which is slightly larger until convergence.
+in these: q'' is bounded by a_max T^2, q' by v_max T and q''' by j_max T^3. The square root T of
+T^2 is replaced by its tangent at the previous solution, which is slightly larger until convergence,
+and T^3 likewise by its tangent, which is slightly smaller.
 
 The result is not guaranteed to satisfy the constraints between samples. The caller checks it for
 collisions and scales it to the limits.
@@ -27,7 +29,6 @@ from pydrake.solvers import ClarabelSolver, MathematicalProgram
 from pydrake.trajectories import BsplineTrajectory, Trajectory
 from scipy import sparse
 
-from drake_clutter.planning.time_parameterization import LIMIT_FRACTION
 from drake_clutter.robots.robot_model import RobotModel
 
 Floats = NDArray[np.float64]
@@ -39,7 +40,8 @@ TRUST_REGION_RADII = (0.8, 0.4, 0.2)
 LINEARIZED_TILT_RADII = (0.4, 0.2, 0.1, 0.05, 0.03)
 """Trust region radii where the tool is kept vertical by a linearized constraint [rad]."""
 NUM_COLLISION_SAMPLES = 50
-"""Points of the spline at which distances are imposed; tool accelerations at every second one."""
+"""Points of the spline at which distances and tool speeds are imposed; tool accelerations at every
+second one."""
 CONVERGENCE_TOLERANCE = 0.02
 """Change of the control points [rad], and relative change of the duration, at convergence."""
 MIN_VERTICAL_TRAVEL = 0.002
@@ -48,6 +50,8 @@ sideways while it is lifted drags its neighbors along."""
 ENDPOINT_FRACTION = 0.15
 """Fraction of the path at either end where distances below the required ones are not increased: the
 fixed endpoints leave no freedom there."""
+NUM_FIXED_CONTROL_POINTS = 3
+"""Equal control points at either end: they give zero velocity and acceleration there."""
 _SPLINE_ORDER = 4
 _SMOOTHNESS_WEIGHT = 1e-4
 """Weight of the squared accelerations relative to T^2. It selects the smoothest of the trajectories
@@ -61,6 +65,8 @@ _SAMPLE_PARAMETERS = np.linspace(0.0, 1.0, NUM_COLLISION_SAMPLES + 2)[1:-1]
 """Parameters s of the samples. Shape (NUM_COLLISION_SAMPLES,)."""
 _VALUE_WEIGHTS = _BASIS_SPLINE.vector_values(_SAMPLE_PARAMETERS).T
 """Maps control points to values at the samples. Shape (NUM_COLLISION_SAMPLES, 28)."""
+_DERIVATIVE_WEIGHTS = _BASIS_SPLINE.MakeDerivative(1).vector_values(_SAMPLE_PARAMETERS).T
+"""Maps control points to derivatives at the samples. Shape (NUM_COLLISION_SAMPLES, 28)."""
 _SECOND_DERIVATIVE_WEIGHTS = _BASIS_SPLINE.MakeDerivative(2).vector_values(_SAMPLE_PARAMETERS).T
 """Maps control points to second derivatives at the samples. Shape (NUM_COLLISION_SAMPLES, 28)."""
 
@@ -103,6 +109,7 @@ class TrajectoryOptimizationProblem:
         vertical_start: Whether the tool first moves vertically up.
         vertical_end: Whether the tool last moves vertically down.
         keep_tool_vertical: Whether the tool axis stays vertical.
+        max_tool_speed: Largest speed of the tool [m/s]; infinite without a limit.
         max_tool_acceleration: Largest acceleration of the tool along each axis [m/s^2].
         nearby_distances: Returns all distances below the influence distance, from joint positions
             of shape (n,) and the path parameter s in [0, 1].
@@ -117,25 +124,17 @@ class TrajectoryOptimizationProblem:
     vertical_start: bool
     vertical_end: bool
     keep_tool_vertical: bool
+    max_tool_speed: float
     max_tool_acceleration: float
     nearby_distances: Callable[[Floats, float], list[LinearizedDistance]]
     tool_jacobian: Callable[[Floats], Floats]
     tool_axis: Callable[[Floats], Floats]
 
-    @property
-    def num_fixed_control_points(self) -> int:
-        """Equal control points at either end.
-
-        Two give zero velocity at the ends. Three also give zero acceleration, so that a load does
-        not oscillate on the elastic cup.
-        """
-        return 3 if self.keep_tool_vertical else 2
-
 
 def optimize_trajectory(problem: TrajectoryOptimizationProblem) -> BsplineTrajectory | None:
     """Return a faster trajectory than the initial one, or None if none is found."""
     initial_duration = problem.initial_trajectory.end_time()
-    points = _fit_control_points(problem.initial_trajectory, problem.num_fixed_control_points)
+    points = _fit_control_points(problem.initial_trajectory)
     duration = initial_duration
     is_exact = not problem.keep_tool_vertical or problem.robot.vertical_tool_rows is not None
     for radius in TRUST_REGION_RADII if is_exact else LINEARIZED_TILT_RADII:
@@ -156,16 +155,9 @@ def optimize_trajectory(problem: TrajectoryOptimizationProblem) -> BsplineTrajec
     return BsplineTrajectory(BsplineBasis(_SPLINE_ORDER, knots), points.T)
 
 
-def _fit_control_points(trajectory: Trajectory, num_fixed: int) -> Floats:
-    """Return the control points of the least-squares fit to a trajectory.
-
-    Args:
-        trajectory: Joint positions over time.
-        num_fixed: Number of equal control points at either end.
-
-    Returns:
-        Control points. Shape (28, n).
-    """
+def _fit_control_points(trajectory: Trajectory) -> Floats:
+    """Return the control points of the least-squares fit to a trajectory. Shape (28, n)."""
+    num_fixed = NUM_FIXED_CONTROL_POINTS
     s = np.linspace(0.0, 1.0, 120)
     q = trajectory.vector_values(s * trajectory.end_time()).T
     B = _BASIS_SPLINE.vector_values(s).T
@@ -247,13 +239,19 @@ def _limit_constraints(
     q = _VALUE_WEIGHTS @ points
     robot = problem.robot
     n = robot.num_joints
-    speeds = np.tile(LIMIT_FRACTION * robot.velocity_limits, NUM_CONTROL_POINTS - 1)
-    accelerations = np.tile(LIMIT_FRACTION * robot.acceleration_limits, NUM_CONTROL_POINTS - 2)
+    speeds = np.tile(robot.velocity_limits, NUM_CONTROL_POINTS - 1)
+    accelerations = np.tile(robot.acceleration_limits, NUM_CONTROL_POINTS - 2)
     # T is at most the tangent of sqrt(T^2): T^2 / (2 T_previous) + T_previous / 2.
     constraints.add_two_sided(
         _derivative_matrix(1, n), speeds / (2 * duration), speeds * duration / 2
     )
     constraints.add_two_sided(_derivative_matrix(2, n), accelerations)
+    if np.isfinite(robot.jerk_limits).all():
+        # T^3 is at least the tangent of (T^2)^1.5: 1.5 T_previous T^2 - T_previous^3 / 2.
+        jerks = np.tile(robot.jerk_limits, NUM_CONTROL_POINTS - 3)
+        constraints.add_two_sided(
+            _derivative_matrix(3, n), 1.5 * duration * jerks, -jerks * duration**3 / 2
+        )
     samples = [
         (k, distance)
         for k, s in enumerate(_SAMPLE_PARAMETERS)
@@ -269,6 +267,16 @@ def _limit_constraints(
             _directional_matrix(-_VALUE_WEIGHTS[index], gradients),
             np.zeros(len(index)),
             slack - (gradients * q[index]).sum(axis=1),
+        )
+    if math.isfinite(problem.max_tool_speed):
+        J = np.array([problem.tool_jacobian(at)[3:] for at in q])
+        velocities = (J @ (_DERIVATIVE_WEIGHTS @ points)[:, :, None])[:, :, 0]
+        directions = velocities / np.maximum(np.linalg.norm(velocities, axis=1), 1e-9)[:, None]
+        speed = np.full(len(q), problem.max_tool_speed)
+        constraints.add(
+            _directional_matrix(_DERIVATIVE_WEIGHTS, (directions[:, None] @ J)[:, 0]),
+            -speed / (2 * duration),
+            speed * duration / 2,
         )
     if math.isfinite(problem.max_tool_acceleration):
         index = np.repeat(np.arange(0, NUM_COLLISION_SAMPLES, 2), 3)
@@ -302,7 +310,7 @@ def _add_vertical_tool_constraints(
         for q in control:
             prog.AddLinearEqualityConstraint(rows, rows @ points[0], q)
         return
-    num_vertical = problem.num_fixed_control_points + 2
+    num_vertical = NUM_FIXED_CONTROL_POINTS + 2
     for k in range(num_vertical, NUM_CONTROL_POINTS - num_vertical):
         x, y, z = problem.tool_axis(points[k])
         J_rotation = problem.tool_jacobian(points[k])[:3]
@@ -327,7 +335,7 @@ def _add_vertical_motion_constraints(
         prog: Program to which the constraint is added.
         control: Variables of the control points. Shape (28, n).
     """
-    num_fixed = problem.num_fixed_control_points
+    num_fixed = NUM_FIXED_CONTROL_POINTS
     for is_vertical, end, inwards in (
         (problem.vertical_start, 0, 1),
         (problem.vertical_end, NUM_CONTROL_POINTS - 1, -1),
@@ -360,7 +368,7 @@ def _solve_subproblem(
         New control points, shape (28, n), and duration [s]; None if the subproblem is infeasible.
     """
     n = problem.robot.num_joints
-    num_fixed = problem.num_fixed_control_points
+    num_fixed = NUM_FIXED_CONTROL_POINTS
     radius = np.full((NUM_CONTROL_POINTS, n), trust_region_radius)
     radius[:num_fixed] = radius[-num_fixed:] = 0.0
     prog = MathematicalProgram()
@@ -376,7 +384,7 @@ def _solve_subproblem(
         _add_vertical_tool_constraints(problem, points, prog, control)
     _limit_constraints(problem, points, duration).add_to(prog, x)
     prog.AddLinearCost([1 / duration**2], 0.0, x[-1:])
-    limits = np.tile(LIMIT_FRACTION * problem.robot.acceleration_limits, NUM_CONTROL_POINTS - 2)
+    limits = np.tile(problem.robot.acceleration_limits, NUM_CONTROL_POINTS - 2)
     relative_accelerations = sparse.diags(1 / limits) @ _derivative_matrix(2, n) / duration**2
     prog.AddQuadraticCost(
         2 * _SMOOTHNESS_WEIGHT * (relative_accelerations.T @ relative_accelerations).toarray(),

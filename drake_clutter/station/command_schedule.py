@@ -9,12 +9,9 @@ from pydrake.trajectories import PathParameterizedTrajectory, PiecewisePolynomia
 
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.planning.arm_dynamics import arm_dynamics
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
-from drake_clutter.planning.time_parameterization import (
-    dynamics_plant,
-    inverse_dynamics,
-    sample_motion,
-)
+from drake_clutter.planning.time_parameterization import sample_motion
 
 Floats = NDArray[np.float64]
 
@@ -74,7 +71,7 @@ def build_command_schedule(
     loaded = plan.payload
     placement = list[tuple[str, Trajectory | None, Payload]]([("release", None, loaded)])
     if plan.guarded_descent is not None:
-        descent = _truncate(plan.guarded_descent, contact_time)
+        descent = _truncate(plan.guarded_descent.trajectory, contact_time)
         placement = [
             ("steady", None, loaded),
             ("descend", descent, loaded),
@@ -100,7 +97,7 @@ def build_command_schedule(
             num_joints = approach.trajectory.rows()
             q = np.repeat(commands[-1][-1:, :num_joints], 2, axis=0)
             v = a = np.zeros_like(q)
-        torques = inverse_dynamics(dynamics_plant(cell, payload), q, v, a)
+        torques = arm_dynamics(cell, payload).inverse_dynamics(q, v, a)
         times.append(time + np.linspace(0.0, duration, len(q)))
         commands.append(np.column_stack([q, v, torques]))
         time += duration

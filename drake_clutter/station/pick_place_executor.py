@@ -17,8 +17,8 @@ from pydrake.systems.framework import (
 
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.planning.pick_place_plan import DESCENT_SPEED, PickPlacePlan
-from drake_clutter.planning.time_parameterization import dynamics_plant, inverse_dynamics
+from drake_clutter.planning.arm_dynamics import arm_dynamics
+from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.station.command_schedule import CommandSchedule, build_command_schedule
 from drake_clutter.station.messages import ExecutorStatus, Message, PlannedMove
@@ -59,9 +59,9 @@ class ExecutorState(Message):
     @property
     def lowered_distance(self) -> float:
         """Distance between the planned and the actual release height [m]."""
-        if self.plan is None:
+        if self.plan is None or self.plan.guarded_descent is None:
             return 0.0
-        return min(self.plan.max_descent, self.contact_time * DESCENT_SPEED)
+        return self.plan.guarded_descent.depth_at(self.contact_time)
 
     def elapsed(self, time: float) -> float:
         """Return the time since the start of the plan, at most its duration [s].
@@ -125,7 +125,7 @@ class PickPlaceExecutor(LeafSystem):
         robot = load_robot(cell.robot)
         home = robot.home[None]
         zero = np.zeros((1, robot.num_joints))
-        gravity = inverse_dynamics(dynamics_plant(cell, Payload()), home, zero, zero)
+        gravity = arm_dynamics(cell, Payload()).inverse_dynamics(home, zero, zero)
         self._home_command = np.hstack([home, zero, gravity]).ravel()
         self._plan = self.DeclareAbstractInputPort("plan", AbstractValue.Make(PlannedMove()))
         self._tools = cell.gripper.tools
