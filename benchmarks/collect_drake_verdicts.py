@@ -14,6 +14,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from pydantic import BaseModel
 
 from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.config import ClutterConfig
@@ -33,7 +34,7 @@ from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.drake_judge import DrakeJudge
 from drake_clutter.simulation.settle_executor import SettleExecutor
 from drake_clutter.tasks.belief import legal_moves
-from drake_clutter.validation import to_plain
+from drake_clutter.validation import CountOrZero, Finite, to_plain
 from training.results_file import collect_records
 from training.script import WorkersOption, run_script
 
@@ -118,6 +119,38 @@ class WorkerPool:
     ray_address: str | None = None
 
 
+InstabilityRecord = tuple[str, str, Finite, Finite]
+"""Reason, object, displacement [m] and tilt [rad] of an instability."""
+PoseRecord = tuple[Finite, Finite, Finite, Finite, Finite, Finite, Finite]
+"""Translation [m] and quaternion."""
+
+
+class GroupVerdict(BaseModel):
+    """Objects that may touch, and how they are unstable."""
+
+    objects: list[str]
+    fall: InstabilityRecord | None
+
+
+class SceneVerdict(BaseModel):
+    """Record of a scene; see `SceneSettler`."""
+
+    index: CountOrZero
+    groups: list[GroupVerdict]
+    settled: dict[str, tuple[Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite]] = {}
+
+
+class MoveOutcome(BaseModel):
+    """Record of a move; see `MoveRunner`."""
+
+    index: CountOrZero
+    draw: CountOrZero
+    move: tuple[str, str]
+    result: str
+    fall: InstabilityRecord | None
+    place: PoseRecord | None
+
+
 class SceneSettler:
     """Settles the groups of a batch's scenes; a worker for `map_ordered`."""
 
@@ -184,6 +217,7 @@ def collect_verdicts(batch: SceneBatch, count: int, folder: Path, pool: WorkerPo
         asdict(batch) | {"config": to_plain(batch.config)},
         partial(SceneSettler, batch),
         range(count),
+        schema=SceneVerdict,
         workers=pool.workers,
         ray_address=pool.ray_address,
     )
@@ -294,6 +328,7 @@ def collect_moves(
         asdict(batch) | {"config": to_plain(batch.config), "scenes": num_scenes},
         MoveRunner,
         items,
+        schema=MoveOutcome,
         workers=pool.workers,
         ray_address=pool.ray_address,
     )

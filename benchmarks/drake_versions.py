@@ -18,6 +18,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from pydantic import BaseModel
 
 from benchmarks.measurement import Stopwatch, describe_machine
 from drake_clutter.agents.generators import GenerationJob, SceneGenerator
@@ -31,6 +32,7 @@ from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.drake_judge import DrakeJudge
 from drake_clutter.station.station_simulation import TIME_STEP, StationSimulation
+from drake_clutter.validation import Flag
 from training.results_file import Row, provenance
 from training.script import SCENES, print_table, progress, run_script
 
@@ -121,6 +123,13 @@ def measure(
     write_jsonl(verdicts_path(out), header, verdicts)
 
 
+class VerdictRecord(BaseModel):
+    """Record of a scene's verdict."""
+
+    stable: Flag
+    hidden: list[str]
+
+
 def verdicts_path(results: Path) -> Path:
     """Return the record file of the verdicts that belong to a results file."""
     return results.with_suffix(".jsonl.gz")
@@ -159,7 +168,7 @@ def compare(
     """Print the agreement of the verdicts with those of the first file, and the times."""
     results = [
         json.loads(path.read_text(encoding="utf-8"))
-        | {"verdicts": read_jsonl(verdicts_path(path))[1:]}
+        | {"verdicts": read_jsonl(verdicts_path(path), VerdictRecord)[1:]}
         for path in files
     ]
     print_table([table_row(row, results[0]) for row in results])

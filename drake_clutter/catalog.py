@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from drake_clutter.built_mesh import read_mesh_measures, read_surface
-from drake_clutter.files import InputError, format_value, input_error
+from drake_clutter.files import InputError, format_value, input_error, reading_file
 from drake_clutter.mesh_file import load_object_mesh
 from drake_clutter.resources import resource_path
 from drake_clutter.validation import InRange, NonEmptyText, StrictModel, allowed_error, validate
@@ -409,9 +409,11 @@ def load_catalog(folder: Path | None = None) -> Catalog:
             allowed.
     """
     shipped = resource_path("sdf_assets")
-    folders = (
-        (shipped,) if folder is None or folder.resolve() == shipped else (shipped, folder.resolve())
-    )
+    folders: tuple[Path, ...] = (shipped,)
+    if folder is not None:
+        with reading_file(folder, "an asset folder"):
+            own_folder = folder.resolve()
+        folders = tuple(dict.fromkeys((shipped, own_folder)))
     classes: dict[str, ObjectClass] = {}
     object_sets: dict[str, tuple[str, ...]] = {}
     for asset_folder in folders:

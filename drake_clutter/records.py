@@ -17,20 +17,23 @@ from typing import Any, TextIO
 
 from drake_clutter.files import InputError, atomic_write, input_error, parse_json, reading_file
 from drake_clutter.resources import git_commit
+from drake_clutter.validation import validate
 
 _CONTENT = "a record file, unmodified"
 """What a file may contain, for messages."""
 
 
-def read_jsonl(path: Path) -> list[Any]:
+def read_jsonl(path: Path, schema: Any = Any) -> list[Any]:
     """Return the header and the records of a record file; an empty list if there is none.
 
     Args:
         path: The file. For a compressed file, the journal of an interrupted run is read if it
             holds more records.
+        schema: Type of a record, such as a pydantic model.
 
     Raises:
-        InputError: The file cannot be read, or a line is not JSON.
+        InputError: The file cannot be read, a line is not JSON, or a field of a record has a value
+            that is not allowed.
     """
     journal = _journal_path(path)
     lines: list[str] = []
@@ -38,7 +41,7 @@ def read_jsonl(path: Path) -> list[Any]:
         with reading_file(journal, _CONTENT):
             lines = _complete_lines(journal.read_text(encoding="utf-8"))
     compressed = _compressed_lines(path)
-    return _parse_lines(lines if len(lines) > len(compressed) else compressed, path)
+    return _parse_lines(lines if len(lines) > len(compressed) else compressed, path, schema)
 
 
 def write_jsonl(path: Path, header: Any, records: Iterable[Any]) -> None:
@@ -57,6 +60,7 @@ def resume_jsonl(
     path: Path,
     header: Mapping[str, Any],
     make_records: Callable[[int], Iterable[Any]],
+    schema: Any = Any,
     upgrade_header: Callable[[Any], Any] = lambda header: header,
 ) -> Generator[Any, None, None]:
     """Yield the header of a record file, its records, and the records that it lacks.
@@ -69,11 +73,12 @@ def resume_jsonl(
         header: All parameters that determine the records. The file's header also holds the `commit`
             at which the file was created.
         make_records: Receives the number of records in the file; yields those that follow.
+        schema: Type of a record, as in `read_jsonl`.
         upgrade_header: Converts a header written by an earlier version to the current format.
 
     Raises:
-        InputError: The file cannot be read or has another header, or another process is appending
-            to it.
+        InputError: The file cannot be read, has another header or a record that is not allowed, or
+            another process is appending to it.
     """
     header = json.loads(json.dumps(header))
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -83,7 +88,7 @@ def resume_jsonl(
         lines, compressed = _complete_lines(text), _compressed_lines(path)
         if len(lines) < len(compressed) or not lines:
             lines = compressed or [json.dumps({**header, "commit": git_commit()}) + "\n"]
-        written_header, *records = _parse_lines(lines, path)
+        written_header, *records = _parse_lines(lines, path, schema)
         with reading_file(path, _CONTENT):
             upgraded = upgrade_header(written_header)
         if text != "".join(lines):
@@ -123,13 +128,16 @@ def _compressed_lines(path: Path) -> list[str]:
         return gzip.decompress(path.read_bytes()).decode().splitlines(keepends=True)
 
 
-def _parse_lines(lines: Iterable[str], path: Path) -> list[Any]:
-    """Return the documents of the lines of a file, whose first is a JSON object."""
+def _parse_lines(lines: Iterable[str], path: Path, schema: Any) -> list[Any]:
+    """Return the documents of the lines of a file: the header, a JSON object, and the records."""
     documents = []
     for number, line in enumerate(lines, start=1):
-        document = parse_json(line, f"{path}: line {number}", _CONTENT, allow_nan=True)
-        if number == 1 and not isinstance(document, dict):
-            raise input_error(str(path), f"line 1: {line}; expected the header, a JSON object")
+        source = f"{path}: line {number}"
+        document = parse_json(line, source, _CONTENT, allow_nan=True)
+        if number > 1:
+            validate(schema, document, source)
+        elif not isinstance(document, dict):
+            raise input_error(source, f"{line}; expected the header, a JSON object")
         documents.append(document)
     return documents
 

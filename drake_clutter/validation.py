@@ -245,7 +245,7 @@ def _error_message(schema: Any, error: ErrorDetails) -> str:
         return f"{_field_path(owner, location[-1])}: is missing; needed are {needed}"
     field, node = _locate(schema, location)
     if error_type == "refused":
-        return f"{field}.{error['msg']}"
+        return f"{field}{'.' if field else ''}{error['msg']}"
     if error_type in ("union_tag_not_found", "union_tag_invalid"):
         tag = error["input"].get(node["discriminator"]["propertyName"])
         field = _field_path(field, node["discriminator"]["propertyName"])

@@ -12,7 +12,7 @@ import gzip
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -72,6 +72,7 @@ from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.generation_task import ClutterGeneration, GenerationTaskConfig
 from drake_clutter.validation import load_config_as, to_plain
 from drake_clutter.yaml_io import to_yaml
+from training.evaluate_explorers import EpisodeRecord, to_result
 from training.results_file import ResultsFile
 
 NUM_MUTANTS = int(os.environ.get("DAMAGED_FILES", "100"))
@@ -435,14 +436,18 @@ def replace_camera() -> Any:
 def record_file(folder: Path) -> Reader:
     path = folder / "records.jsonl.gz"
     header = {"seed": 3, "config": to_plain(ClutterConfig())}
-    write_jsonl(path, {**header, "commit": "0"}, [{"k": k, "value": 0.5 * k} for k in range(3)])
-
-    def make_records(done: int) -> Iterable[Any]:
-        return ({"k": k} for k in range(done, 3))
+    record = {
+        **{"scene": "a", "agent": "random", "ended": "all found", "commit": "0"},
+        **{"hidden": 3, "found": 3, "moves": 2, "found_after": [1, 3], "not_carried_out": 0},
+    }
+    write_jsonl(path, {**header, "commit": "0"}, [record] * 3)
 
     def read() -> None:
-        read_jsonl(path)
-        with closing(resume_jsonl(path, header, make_records)) as lines:
+        for episode in read_jsonl(path, EpisodeRecord)[1:]:
+            to_result(episode)
+        with closing(
+            resume_jsonl(path, header, lambda done: [record] * (3 - done), EpisodeRecord)
+        ) as lines:
             list(lines)
 
     return Reader([path], read)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from test_damaged_files import image_dataset
 from torch import nn
 from typer.testing import CliRunner
 
@@ -17,6 +18,7 @@ from drake_clutter.resources import resource_path
 from drake_clutter.systems.scenario import Scenario
 from drake_clutter.tasks.generation_task import GenerationTaskConfig
 from drake_clutter.validation import load_config_as
+from training import train_detector
 from training.training_loop import train_to_end
 
 
@@ -95,3 +97,15 @@ def test_messages_are_one_line_of_bounded_length() -> None:
     assert len(message) <= MAX_ERROR_LENGTH
     assert message.startswith("scene.yaml: ")
     assert message.endswith("; expected a scene")
+
+
+@pytest.mark.parametrize("held_out", [1, 200])
+def test_more_held_out_images_than_there_are_are_refused(held_out: int, tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    image_dataset(images)
+    settings = [f"images={images}", f"held_out={held_out}"]
+    with pytest.raises(
+        InputError, match=rf"held_out: {held_out}; expected fewer than the 1 images of {images}"
+    ):
+        train_detector.main(tmp_path / "run", settings=settings)
+    assert not (tmp_path / "run").exists()

@@ -324,3 +324,13 @@ def test_the_same_seed_generates_the_same_dataset(
     )
     with pytest.raises(InputError, match="of another job"):
         script.main(tmp_path / "one", count=2, heap_fraction=0.0, seed=4, objects="ycb7")
+
+
+def test_a_mirrored_pose_is_refused(tmp_path: Path, images: list[AnnotatedImage]) -> None:
+    write_images(tmp_path / "000000", images[:1], DEFAULT_CELL.camera, [*CLASSES])
+    path = tmp_path / "000000" / "scene_gt.json"
+    document = json.loads(path.read_text())
+    document["0"][0]["cam_R_m2c"] = [-1, 0, 0, 0, 1, 0, 0, 0, 1]
+    path.write_text(json.dumps(document))
+    with pytest.raises(InputError, match=r"scene_gt.json: .*the nine numbers of a rotation matrix"):
+        ImageDataset(tmp_path)[0]

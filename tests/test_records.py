@@ -3,12 +3,16 @@
 import gzip
 import json
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
+from pydantic import BaseModel
 
 from drake_clutter.files import InputError
 from drake_clutter.records import read_jsonl, resume_jsonl, write_jsonl
+from drake_clutter.validation import CountOrZero
 
 NAMES = pytest.mark.parametrize("name", ["records.jsonl", "records.jsonl.gz"])
 
@@ -93,3 +97,33 @@ def test_written_records_are_read(tmp_path: Path) -> None:
     assert read_jsonl(path) == [{"seed": 1}, 0, 1]
     write_jsonl(path, {"seed": 1}, [0, 1])
     assert path.read_bytes() == content
+
+
+class Record(BaseModel):
+    found: CountOrZero
+    found_after: list[CountOrZero]
+
+
+@pytest.mark.parametrize(
+    ("record", "message"),
+    [
+        ({"found": 2}, "found_after: is missing; needed are found, found_after"),
+        (
+            {"found": "2", "found_after": []},
+            "found: '2'; expected a whole number from 0 to 1e\\+09",
+        ),
+        ({"found": 2, "found_after": [0, -1]}, r"found_after\[1\]: -1; expected a whole number"),
+        ([2], r"\[2\]; expected a mapping with found, found_after"),
+    ],
+)
+def test_a_record_with_a_wrong_field_is_refused(record: Any, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "records.jsonl.gz"
+    write_jsonl(path, {"seed": 1}, [{"found": 0, "found_after": [], "commit": "x"}, record])
+    with pytest.raises(InputError, match=f"records.jsonl.gz: line 3: {message}"):
+        read_jsonl(path, Record)
+    with (
+        closing(resume_jsonl(path, {"seed": 1}, lambda _: [], Record)) as lines,
+        pytest.raises(InputError, match=f"records.jsonl.gz: line 3: {message}"),
+    ):
+        next(lines)
+    assert len(read_jsonl(path)) == 3, "the file is unchanged"

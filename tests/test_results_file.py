@@ -7,7 +7,9 @@ from shutil import copyfile
 import pytest
 
 from drake_clutter.files import InputError
+from drake_clutter.records import read_jsonl, write_jsonl
 from training import evaluate_closed_loop
+from training.evaluate_closed_loop import EpisodeRecord
 from training.results_file import ResultsFile
 
 
@@ -41,3 +43,14 @@ def test_published_closed_loop_episodes_are_resumed(tmp_path: Path) -> None:
             copy = Path(copyfile(path, tmp_path / path.name))
             records = evaluate_closed_loop.collect_episodes(evaluation, 3, 1, copy)
             assert [r["number"] for r in records] == [evaluation.first + k for k in range(3)]
+
+
+def test_an_incomplete_record_of_an_episode_is_refused(tmp_path: Path) -> None:
+    """An episode that ended with an exception has no metrics; any other has all."""
+    record = {"number": 60, "arm_can": True, "wall": 1.0, "commit": "x"}
+    path = tmp_path / "records.jsonl.gz"
+    write_jsonl(path, {}, [record | {"ended": "exception"}])
+    assert len(read_jsonl(path, EpisodeRecord)) == 2
+    write_jsonl(path, {}, [record | {"ended": "all found"}])
+    with pytest.raises(InputError, match=r"line 2: found: is missing; expected the record of an"):
+        read_jsonl(path, EpisodeRecord)

@@ -19,10 +19,11 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 import typer
+from pydantic import BaseModel, model_validator
 
 from drake_clutter.agents.explorers import PRETRAINED_EXPLORERS
 from drake_clutter.catalog import load_catalog
@@ -45,7 +46,15 @@ from drake_clutter.systems.tracking import match_to_ground_truth
 from drake_clutter.tasks.arm_reachability_bound import ArmReachabilityBound
 from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration_task import ExplorationTask, TerminationReason
-from drake_clutter.validation import override_config, to_plain
+from drake_clutter.validation import (
+    CountOrZero,
+    Flag,
+    NonEmptyText,
+    NonNegative,
+    override_config,
+    rejected_error,
+    to_plain,
+)
 from training.results_file import ResultsFile, Row, collect_records
 from training.script import (
     RESULTS,
@@ -182,6 +191,32 @@ class EpisodeRunner:
         return task, backend.belief.objects, robot_time
 
 
+class EpisodeRecord(BaseModel):
+    """Record of an episode; one that ended with an exception has the first fields alone."""
+
+    number: CountOrZero
+    arm_can: Flag
+    ended: NonEmptyText
+    wall: NonNegative
+    commit: str
+    hidden: CountOrZero = 0
+    found: CountOrZero = 0
+    moves: CountOrZero = 0
+    objects: CountOrZero = 0
+    known: CountOrZero = 0
+    recognised: CountOrZero = 0
+    robot: NonNegative = 0
+    results: dict[str, CountOrZero] = {}
+    not_planned: dict[str, CountOrZero] = {}
+
+    @model_validator(mode="after")
+    def _check_completeness(self) -> Self:
+        missing = EpisodeRecord.model_fields.keys() - self.model_fields_set
+        if missing and self.ended != EXCEPTION:
+            raise rejected_error(f"{min(missing)}: is missing; expected the record of an episode")
+        return self
+
+
 def collect_episodes(
     evaluation: ClosedLoopEvaluation, count: int, workers: int, path: Path
 ) -> list[Row]:
@@ -221,6 +256,7 @@ def collect_episodes(
         header,
         EpisodeRunner,
         requests,
+        schema=EpisodeRecord,
         workers=workers,
         max_items_per_process=EPISODES_PER_PROCESS,
         upgrade=upgrade_scenario,

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from pydantic import BaseModel
 
 from drake_clutter.agents.backend_factory import FIDELITIES
 from drake_clutter.agents.episode_evaluation import (
@@ -32,7 +33,7 @@ from drake_clutter.scenes.scene_dataset import SceneDataset, load_scene_dataset
 from drake_clutter.statistics import ratio_interval
 from drake_clutter.tasks.episode import current_fidelity
 from drake_clutter.tasks.exploration_task import TerminationReason
-from drake_clutter.validation import to_plain
+from drake_clutter.validation import Count, CountOrZero, NonEmptyText, to_plain
 from training.results_file import ResultsFile, Row, collect_records
 from training.script import (
     RESULTS,
@@ -80,6 +81,20 @@ TABLES = dict.fromkeys(YCB7_SETS, ("table2", YCB7_EXPLORERS)) | dict.fromkeys(
 """By scene dataset: the results file of its rows, and the explorers that are evaluated on it."""
 
 
+class EpisodeRecord(BaseModel):
+    """Record of an episode; see `EpisodeResult`."""
+
+    scene: NonEmptyText
+    agent: NonEmptyText
+    ended: NonEmptyText
+    hidden: Count
+    found: CountOrZero
+    moves: CountOrZero
+    found_after: list[CountOrZero]
+    not_carried_out: CountOrZero
+    commit: str
+
+
 def episodes_path(folder: Path, set_name: str, agent: str) -> Path:
     """Return the record file of an explorer's episodes on a scene dataset."""
     if agent.endswith(".safetensors"):
@@ -121,7 +136,7 @@ def collect_episodes(
     }
     player = partial(EpisodeRunner, config, None, max(MOVE_LIMITS), seed, fidelity)
     episodes = [EpisodeSpec(SCENES / scenes.name, k, agent, k) for k in range(count)]
-    return collect_records(path, header, player, episodes, workers=workers)
+    return collect_records(path, header, player, episodes, schema=EpisodeRecord, workers=workers)
 
 
 def to_result(record: Mapping[str, Any]) -> EpisodeResult:

@@ -20,9 +20,10 @@ from collections.abc import Iterable, Iterator
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import typer
+from pydantic import BaseModel, model_validator
 
 from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.catalog import Catalog, load_catalog
@@ -43,6 +44,7 @@ from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.drake_judge import DrakeJudge
 from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.tasks.generation_task import GenerationTaskConfig
+from drake_clutter.validation import CountOrZero, Flag, NonEmptyText, allowed_error
 from drake_clutter.workers.parallel_map import map_ordered
 from training.results_file import provenance
 from training.script import CatalogOption, SeedOption, WorkersOption, progress, run_script
@@ -68,6 +70,22 @@ def read_stable_scenes(folder: Path, catalog: Catalog) -> Iterator[SceneRecord]:
             solvability = "" if answer is None else answer.value
             num_hidden = len(file.verdict.hidden)
             yield SceneRecord(file.scene.derivation, form, num_hidden, solvability, settled)
+
+
+class GraphVerdict(BaseModel):
+    """Record of a scene graph; see `GraphJudge`."""
+
+    fast: Flag
+    fell: str | None = None
+    rules: tuple[NonEmptyText, ...] = ()
+    form: str = ""
+    hidden: CountOrZero = 0
+
+    @model_validator(mode="after")
+    def _check_graph(self) -> Self:
+        if self.hidden and not (self.rules and self.form):
+            raise allowed_error("rules and form of the graph in which objects are hidden")
+        return self
 
 
 class GraphJudge:
@@ -210,6 +228,7 @@ def main(
             work / VERDICTS_FILE,
             job.to_dict(),
             lambda done: map_ordered(judge, range(done, max_generated), workers=workers),
+            GraphVerdict,
         )
         with closing(records):
             metadata["commit"] = next(records)["commit"]  # The commit of the verdicts.

@@ -121,6 +121,7 @@ def collect_records(
     make_worker: Callable[[], Callable[[Any], Any]],
     items: Sequence[Any],
     *,
+    schema: Any,
     workers: int,
     ray_address: str | None = None,
     max_items_per_process: int | None = None,
@@ -134,6 +135,7 @@ def collect_records(
         make_worker: See `map_ordered`. The worker returns an item's record, as a dictionary or a
             dataclass; `provenance` is added to it.
         items: All items, also those that are already in the file.
+        schema: Type of a record; see `read_jsonl`.
         workers: See `map_ordered`.
         ray_address: See `map_ordered`.
         max_items_per_process: See `map_ordered`.
@@ -153,5 +155,5 @@ def collect_records(
             record = result if isinstance(result, dict) else asdict(result)
             yield record | software
 
-    with closing(resume_jsonl(path, header, compute, upgrade)) as lines:
+    with closing(resume_jsonl(path, header, compute, schema, upgrade)) as lines:
         return list(islice(lines, 1, 1 + len(items)))

@@ -3,6 +3,7 @@
 Frames: T is the support and the world, B is the robot's base.
 """
 
+import os
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -185,5 +186,5 @@ def _with_absolute_paths(document: Any, folder: Path) -> Any:
 def _with_absolute_path(part: dict[str, Any], folder: Path) -> dict[str, Any]:
     model = part.get("model")
     if isinstance(model, str) and model and not model.startswith("package://"):
-        return {**part, "model": str((folder / model).resolve())}
+        return {**part, "model": os.path.abspath(folder / model)}
     return part

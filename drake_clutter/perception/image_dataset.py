@@ -382,7 +382,8 @@ class ImageDataset:
 def _check_rotation(matrix: tuple[float, ...]) -> tuple[float, ...]:
     """Check that nine numbers are a rotation matrix, but for rounding."""
     R = np.reshape(matrix, (3, 3))
-    if not (np.abs(R) < 2).all() or not np.allclose(R @ R.T, np.eye(3), atol=1e-3):
+    is_orthogonal = (np.abs(R) < 2).all() and np.allclose(R @ R.T, np.eye(3), atol=1e-3)
+    if not is_orthogonal or np.linalg.det(R) < 0:
         raise allowed_error("the nine numbers of a rotation matrix")
     return matrix
 
