@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.validation import StrictModel
+from drake_clutter.validation import Finite, NonNegative, Positive, StrictModel
 
 MEASURES_FILE = "mesh.json"
 SURFACE_FILE = "surface.npy"
@@ -30,11 +30,11 @@ class MeshMeasures(StrictModel):
     """
 
     sha256: str
-    scale: float
-    extents: tuple[float, float, float]
+    scale: Positive
+    extents: tuple[NonNegative, NonNegative, NonNegative]
     repairs: tuple[str, ...]
-    max_bulge: float
-    max_recess: float
+    max_bulge: Finite
+    max_recess: Finite
 
 
 def hash_mesh_file(path: Path) -> str:
