@@ -1,4 +1,7 @@
-"""Convex meshes of a user: static judge, rays and Drake."""
+"""Meshes of a user: static judge, rays and Drake."""
+
+# trimesh is typed in part only.
+# mypy: allow-untyped-calls
 
 import math
 from itertools import product
@@ -15,11 +18,17 @@ from test_static_judge import STEP
 from drake_clutter.assets import build_assets
 from drake_clutter.catalog import ObjectClass, load_catalog
 from drake_clutter.config import ClutterConfig
-from drake_clutter.scenes.interfaces import InconclusiveReason, InconclusiveVerdict, Verdict
-from drake_clutter.scenes.scene import Pose, SceneObject
+from drake_clutter.grammar import Orientation
+from drake_clutter.scenes.interfaces import (
+    InconclusiveReason,
+    InconclusiveVerdict,
+    Instability,
+    InstabilityReason,
+    Verdict,
+)
+from drake_clutter.scenes.scene import TRAY, Pose, SceneObject
 from drake_clutter.simulation.camera_renderer import CameraRenderer
 from drake_clutter.simulation.drake_judge import DrakeJudge
-from drake_clutter.simulation.hybrid import HybridJudge
 from drake_clutter.stability.ray_caster import RayCaster
 from drake_clutter.stability.static_judge import StaticStabilityJudge
 
@@ -75,6 +84,29 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> dict[str, ObjectClass]:
     build_assets(folder)
     catalog = load_catalog(folder)
     return {name: catalog.classes[name] for name in meshes}
+
+
+@pytest.fixture(scope="module")
+def cups(tmp_path_factory: pytest.TempPathFactory) -> dict[str, ObjectClass]:
+    """Return a square cup of 100 x 100 x 60 mm, with a floor and walls of 10 mm.
+
+    Its five boxes share no edges, so each is a convex piece.
+    """
+    folder = tmp_path_factory.mktemp("user") / "cups"
+    folder.mkdir()
+    slab = trimesh.creation.box((0.0998, 0.0998, 0.01))
+    walls = []
+    for k in range(4):
+        wall = trimesh.creation.box((0.01, 0.0899, 0.05))
+        wall.apply_translation((0.045, 0.0049, 0.03))
+        wall.apply_transform(trimesh.transformations.rotation_matrix(k * math.pi / 2, (0, 0, 1)))
+        walls.append(wall)
+    trimesh.util.concatenate([slab, *walls]).export(folder / "cup.stl")
+    (folder / "catalog.yaml").write_text(
+        "classes: {cup: {shape: mesh, mesh: cup.stl, mass_g: 300}}"
+    )
+    build_assets(folder)
+    return {"cup": load_catalog(folder).classes["cup"]}
 
 
 def as_made(
@@ -198,7 +230,7 @@ def test_the_caster_sees_own_meshes_as_the_camera_does(
     tumbled = [
         SceneObject(name, own[name], Pose.from_rotation(turn, (x, 0.02, 0.15)))
         for name, turn, x in zip(
-            ("prism", "frustum", "wedge"), turns, (-0.12, 0.0, 0.11), strict=False
+            ("prism", "bracket", "wedge"), turns, (-0.12, 0.0, 0.11), strict=False
         )
     ]
     scene = scene_of(*tumbled, resting("sugar_box", xy=(0.05, 0.0), floor=0.25, name="before"))
@@ -209,18 +241,67 @@ def test_the_caster_sees_own_meshes_as_the_camera_does(
     assert sum(0.02 < share < 0.98 for share in shares.values()) >= 2
 
 
-def test_what_is_not_convex_is_left_to_drake(
-    own: dict[str, ObjectClass], config: ClutterConfig, judge: DrakeJudge
+@pytest.mark.parametrize(("x", "stable"), [(0.120, True), (0.134, False)])
+def test_a_bracket_stands_by_its_center_of_mass(
+    x: float,
+    stable: bool,
+    own: dict[str, ObjectClass],
+    static_judge: StaticStabilityJudge,
+    judge: DrakeJudge,
 ) -> None:
-    scene = scene_of(as_made(own["bracket"], (0.1, 0.0), 0.0, name="bracket"))
-    answer = InconclusiveVerdict(InconclusiveReason.NOT_CONVEX, "bracket")
-    static_judge = StaticStabilityJudge(config)
-    assert (
-        static_judge.find_instability(scene)
-        == static_judge.find_supports(scene)
-        == static_judge.judge(scene, rng())
-        == answer
+    """The center of mass of the L is 11.7 mm off that of its bounding box, the edge at 115 mm.
+
+    Its area is 100 x 30 and 30 x 50 mm, with centers at x = 50 and 15 mm from its left side.
+    """
+    assert own["bracket"].center_of_mass[0] == pytest.approx(
+        (3000 * 50 + 1500 * 15) / 4.5e6 - 0.050
     )
-    verdict = HybridJudge(config).judge(scene, rng(4))
-    assert verdict == judge.judge(scene, rng(4))
-    assert verdict.stable
+    scene = scene_of(BELOW, as_made(own["bracket"], (x, 0.0), 0.060))
+    mine, drakes = static_judge.judge(scene, rng(1)), judge.judge(scene, rng(1))
+    assert isinstance(mine, Verdict)
+    assert mine.stable is drakes.stable is stable
+    assert mine.visible_fractions == pytest.approx(drakes.visible_fractions, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("x", "expected"), [(0.022, 0.0280), (0.040, 0.0100), (0.055, -0.0050), (0.0, "overlap")]
+)
+def test_a_box_on_the_low_arm_of_a_bracket(
+    x: float,
+    expected: float | str,
+    own: dict[str, ObjectClass],
+    static_judge: StaticStabilityJudge,
+) -> None:
+    """The arm is 30 mm high and ends 50 mm from the center; the wall ends 20 mm before it.
+
+    The box is 28 mm thick and stands upright, its center x from that of the bracket.
+    """
+    box = resting("gelatin_box", Orientation.UPRIGHT_90, (x, 0.0), 0.030, "box")
+    assert np.ptp(box.corners_T[:, 0]) == pytest.approx(0.028)
+    scene = scene_of(as_made(own["bracket"], (0.0, 0.0), 0.0, name="bracket"), box)
+    supports = static_judge.find_supports(scene)
+    if expected == "overlap":
+        assert isinstance(supports, InconclusiveVerdict)
+        assert supports.reason is InconclusiveReason.INTERPENETRATING
+        return
+    assert supports == {"bracket": {TRAY}, "box": {"bracket"}}
+    margins = static_judge.stability_margins(scene)
+    assert not isinstance(margins, InconclusiveVerdict)
+    # The box's own half thickness of 14 mm bounds the margin, too.
+    assert margins["box"] == pytest.approx(min(float(expected), 0.014), abs=0.0011)
+
+
+def test_a_can_over_the_mouth_of_a_cup_falls_in(
+    cups: dict[str, ObjectClass], static_judge: StaticStabilityJudge, judge: DrakeJudge
+) -> None:
+    """Nothing is below the can but the floor of the cup; a wider box rests on the rim."""
+    cup = as_made(cups["cup"], (0.0, 0.0), 0.0, name="cup")
+    can = resting("tomato_soup_can", floor=0.060, name="can")
+    found = static_judge.find_instability(scene_of(cup, can))
+    assert found == Instability(InstabilityReason.UNSUPPORTED, "can")
+    assert not judge.judge(scene_of(cup, can), rng(1)).stable
+    box = resting("cracker_box", floor=0.060, name="box")
+    assert static_judge.find_instability(scene_of(cup, box)) is None
+    inside = scene_of(cup, resting("tomato_soup_can", floor=0.010, name="can"))
+    assert static_judge.find_supports(inside) == {"cup": {TRAY}, "can": {"cup"}}
+    assert static_judge.find_instability(inside) is None

@@ -287,15 +287,17 @@ def summarize_scenes(
     others over all scenes. `largest_stack_share` is the mean fraction of a scene's objects that are
     in its largest stack; `balanced_share` is the fraction of scenes in which that is at most
     `MAX_BALANCED_STACK_FRACTION`; `class_entropy` is the entropy of the classes of all objects
-    [bit]. Keys that end in `ci95` hold 95 % confidence intervals: those of Wilson for rates, that
-    of Gaffke for the mean (`drake_clutter.statistics`).
+    [bit]; `absent_classes` are the classes of the object set that no scene has. Keys that end in
+    `ci95` hold 95 % confidence intervals: those of Wilson for rates, that of Gaffke for the mean
+    (`drake_clutter.statistics`).
 
     Args:
         job: The batch.
         scenes: The scenes and their verdicts.
         solvable: Results of the oracle search; None if it was not run.
     """
-    classes = load_catalog(job.catalog_folder).classes
+    catalog = load_catalog(job.catalog_folder)
+    classes = catalog.classes
     num_stable = 0
     num_hidden = list[int]()
     num_stacks = list[int]()
@@ -337,6 +339,11 @@ def summarize_scenes(
         "balanced_share": float(np.mean(is_balanced)),
         "class_entropy": float(-(class_fractions * np.log2(class_fractions)).sum()),
         "classes": dict(sorted(class_counts.items())),
+        "absent_classes": [
+            object_class.name
+            for object_class in catalog.object_set(job.objects)
+            if object_class.name not in class_counts
+        ],
         "instability_reasons": dict(reasons.most_common()),
         "agent": job.agent,
         "temperature": job.temperature,

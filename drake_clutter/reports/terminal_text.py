@@ -64,6 +64,10 @@ def describe_generation(summary: Mapping[str, Any]) -> dict[str, str]:
         "balanced": _fraction(summary["balanced_share"], None, "scenes") + " (no dominant stack)",
         "class entropy": f"{summary['class_entropy']:.2f} bit",
         "objects by class": _counts(summary["classes"]),
+    }
+    if summary.get("absent_classes"):
+        rows["absent classes"] = _names(summary["absent_classes"])
+    rows |= {
         "unstable scenes": _counts(summary["instability_reasons"]),
         "failed layouts": _counts(summary["layout_failures"]),
         "time": f"{summary['seconds']:.1f} s with {_number(summary['workers'], 'worker')}",

@@ -95,7 +95,6 @@ class InconclusiveReason(Enum):
 
     Attributes:
         LEANING: No face of the object is horizontal.
-        NOT_CONVEX: The object has several convex pieces.
         OUTSIDE_TRAY: The object reaches beyond the support.
         INTERPENETRATING: The object overlaps another one or the support.
         FLOATING: Nothing is below or beside the object's bottom.
@@ -105,7 +104,6 @@ class InconclusiveReason(Enum):
     """
 
     LEANING = "leans"
-    NOT_CONVEX = "is not convex"
     OUTSIDE_TRAY = "is outside the tray"
     INTERPENETRATING = "interpenetrates another object or the tray"
     FLOATING = "floats in the air"

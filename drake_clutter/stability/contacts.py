@@ -1,4 +1,4 @@
-"""Horizontal contact polygons between convex objects.
+"""Horizontal contact polygons between objects.
 
 Frame T is that of the support: its origin is at the center of the floor, and z points up.
 """
@@ -20,8 +20,10 @@ MAX_MISS_DISTANCE = 0.060
 Such an object is `UNSUPPORTED`: its bottom is at the height of the other object's top, but not
 above it. The distance exceeds the gap of a standing pair (`LayoutConfig.standing_gap`, 50 mm).
 """
+_MAX_OUTLINE_CORNERS = 32
+"""Largest number of corners of the contact of objects that are not convex."""
 # Faults that `find_contacts` returns; `InconclusiveReason` explains them.
-NO_FAULT, LEANING, NOT_CONVEX, OUTSIDE, OVERLAPPING, FLOATING, EDGE, UNSUPPORTED = range(8)
+NO_FAULT, LEANING, OUTSIDE, OVERLAPPING, FLOATING, EDGE, UNSUPPORTED = range(7)
 GROUND = -1
 """Index of the support's floor in pairs of objects."""
 
@@ -96,19 +98,10 @@ def _clip_to(polygon, count, other, other_count, dx, dy, margin):  # type: ignor
 
 
 @njit(cache=True)
-def contact_polygon(table, lower_shape, upper_shape, p_lower, p_upper, margin):  # type: ignore[no-untyped-def]
-    """Return the contact polygon of an upper and a lower object in T, shrunk by a margin.
+def _face_contact(table, lower_shape, upper_shape, p_lower, p_upper, margin):  # type: ignore[no-untyped-def]
+    """Return the overlap of the bottom of a shape and the top of another, shrunk by a margin.
 
-    Args:
-        table: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
-        lower_shape: Row of the lower object's shape; -1 for the support's floor.
-        upper_shape: Row of the upper object's shape.
-        p_lower: Origin of the lower object in T [m]. Shape (3,).
-        p_upper: Origin of the upper object in T [m]. Shape (3,).
-        margin: Width by which the contact is shrunk [m].
-
-    Returns:
-        Corners [m]. Shape (V, 2), V may be 0.
+    See `contact_polygon`; the heights are not compared.
     """
     polygon = np.empty((48, 2))
     bottom, num_corners = table[upper_shape].bottom, table[upper_shape].bottom_count
@@ -128,6 +121,99 @@ def contact_polygon(table, lower_shape, upper_shape, p_lower, p_upper, margin): 
             else 0
         )
     return polygon[:count]
+
+
+@njit(cache=True)
+def _is_left(a, b, c):  # type: ignore[no-untyped-def]
+    """Return whether point c lies to the left of the line from a to b."""
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) > 1e-15
+
+
+@njit(cache=True)
+def _outline(points):  # type: ignore[no-untyped-def]
+    """Return the corners of the convex hull of points (n, 2), counter-clockwise.
+
+    They are two for points on a line. The method is the monotone chain (Andrew 1979).
+    """
+    order = np.argsort(points[:, 0] + 1e-9 * points[:, 1])
+    hull = np.empty((2 * len(points) + 1, 2))
+    count = 0
+    for side in range(2):
+        start = count
+        for k in range(len(order)):
+            point = points[order[k] if side == 0 else order[len(order) - 1 - k]]
+            while count >= start + 2 and not _is_left(hull[count - 2], hull[count - 1], point):
+                count -= 1
+            hull[count, 0], hull[count, 1] = point[0], point[1]
+            count += 1
+        count -= 1  # the last point is the first of the other side
+    return hull[:count]
+
+
+@njit(cache=True)
+def contact_polygon(table, lower_shape, upper_shape, p_lower, p_upper, margin):  # type: ignore[no-untyped-def]
+    """Return the contact polygon of an upper and a lower object in T, shrunk by a margin.
+
+    Of objects that are not convex, it is the outline of the contacts of their pieces: what presses
+    on the rim of a bowl may press anywhere within the outline.
+
+    Args:
+        table: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
+        lower_shape: Row of the lower object's shape; -1 for the support's floor.
+        upper_shape: Row of the upper object's shape.
+        p_lower: Origin of the lower object in T [m]. Shape (3,).
+        p_upper: Origin of the upper object in T [m]. Shape (3,).
+        margin: Width by which the contact is shrunk [m].
+
+    Returns:
+        Corners [m]. Shape (V, 2), V may be 0.
+    """
+    if lower_shape < 0 or (
+        table[lower_shape].first_part == lower_shape
+        and table[upper_shape].first_part == upper_shape
+    ):
+        return _face_contact(table, lower_shape, upper_shape, p_lower, p_upper, margin)
+    points = np.empty((256, 2))
+    count = 0
+    for a in range(table[upper_shape].first_part, table[upper_shape].last_part):
+        if table[a].bottom_count == 0:
+            continue
+        for b in range(table[lower_shape].first_part, table[lower_shape].last_part):
+            bottom_z = p_upper[2] + table[a].bottom_z
+            if abs(bottom_z - p_lower[2] - table[b].top_z) >= MAX_CONTACT_GAP:
+                continue
+            part = _face_contact(table, b, a, p_lower, p_upper, 0.0)
+            if count + len(part) > len(points):
+                longer = np.empty((2 * len(points), 2))
+                longer[:count] = points[:count]
+                points = longer
+            points[count : count + len(part)] = part
+            count += len(part)
+    polygon = np.empty((48, 2))
+    if count < 2:
+        return polygon[:0]
+    outline = _outline(points[:count])
+    if len(outline) < 2:
+        return polygon[:0]
+    corners = min(len(outline), _MAX_OUTLINE_CORNERS)
+    chosen = np.empty((corners, 2))
+    for k in range(corners):
+        chosen[k, 0], chosen[k, 1] = (
+            outline[k * len(outline) // corners, 0],
+            outline[k * len(outline) // corners, 1],
+        )
+    # As in `_face_contact`, start with a square that is larger than the contact.
+    center_x, center_y = (
+        (chosen[:, 0].min() + chosen[:, 0].max()) / 2,
+        (chosen[:, 1].min() + chosen[:, 1].max()) / 2,
+    )
+    half_side = 0.1 + max(
+        chosen[:, 0].max() - chosen[:, 0].min(), chosen[:, 1].max() - chosen[:, 1].min()
+    )
+    for k in range(4):
+        polygon[k, 0] = center_x + (half_side if k in (1, 2) else -half_side)
+        polygon[k, 1] = center_y + (half_side if k in (2, 3) else -half_side)
+    return polygon[: _clip_to(polygon, 4, chosen, corners, 0.0, 0.0, margin)]
 
 
 @njit(cache=True)
@@ -233,7 +319,7 @@ def connected_objects(table, shapes, p_T, index, margin):  # type: ignore[no-unt
 
 
 @njit(cache=True)
-def find_contacts(table, shapes, p_T, half_size):  # type: ignore[no-untyped-def]
+def find_contacts(table, shapes, p_T, half_size, is_apart):  # type: ignore[no-untyped-def]
     """Find the contacts between objects, and the first fault.
 
     Args:
@@ -241,22 +327,24 @@ def find_contacts(table, shapes, p_T, half_size):  # type: ignore[no-untyped-def
         shapes: Row of each object's shape in the table. Shape (n,).
         p_T: Origins of the objects in T [m]. Shape (n, 3).
         half_size: Half extents of the support's floor [m]. Shape (2,).
+        is_apart: Pairs of objects that are known not to overlap; otherwise, pieces overlap if they
+            do in height and seen from above. Shape (n, n).
 
     Returns:
         The first fault (`NO_FAULT` if there is none), the index of the object with the fault, the
-        lower (or `GROUND`) and upper object of each contact, shape (c, 2), and the number of each
-        object's stack, shape (n,).
+        object that it overlaps or `GROUND`, the lower (or `GROUND`) and upper object of each
+        contact, shape (c, 2), and the number of each object's stack, shape (n,).
     """
     n = len(shapes)
     pairs = np.empty((n * (n + 1), 2), np.int64)
     count = 0
     stack = np.arange(n)
     fault = NO_FAULT
-    faulty_object = 0
+    faulty_object, other_object = 0, GROUND
     for j in range(n):
         shape = shapes[j]
-        if table[shape].fault != 0:  # The values are those of `shape_table.Fault`.
-            return LEANING if table[shape].fault == 1 else NOT_CONVEX, j, pairs[:0], stack
+        if table[shape].fault != 0:  # The only one is `shape_table.Fault.LEANING`.
+            return LEANING, j, GROUND, pairs[:0], stack
         for axis in range(2):
             beyond = (
                 max(
@@ -266,13 +354,13 @@ def find_contacts(table, shapes, p_T, half_size):  # type: ignore[no-untyped-def
                 - half_size[axis]
             )
             if beyond > MAX_OVERLAP:
-                return OUTSIDE, j, pairs[:0], stack
+                return OUTSIDE, j, GROUND, pairs[:0], stack
     for j in range(n):
         upper = shapes[j]
         bottom_z = p_T[j, 2] + table[upper].bottom_z
         supported = False
         if bottom_z < -MAX_CONTACT_GAP:
-            return OVERLAPPING, j, pairs[:0], stack
+            return OVERLAPPING, j, GROUND, pairs[:0], stack
         if bottom_z < MAX_CONTACT_GAP:
             pairs[count, 0], pairs[count, 1] = GROUND, j
             count += 1
@@ -284,21 +372,34 @@ def find_contacts(table, shapes, p_T, half_size):  # type: ignore[no-untyped-def
             if i == j:
                 continue
             lower = shapes[i]
-            top_z = p_T[i, 2] + table[lower].top_z
-            same_height = abs(bottom_z - top_z) < MAX_CONTACT_GAP
-            height_overlap = min(p_T[j, 2] + table[upper].top_z, top_z) - max(
-                bottom_z, p_T[i, 2] + table[lower].bottom_z
-            )
-            if not same_height and height_overlap <= MAX_OVERLAP:
+            is_joined = table[lower].first_part != lower or table[upper].first_part != upper
+            if is_joined and (
+                _overlap(table, upper, lower, p_T[j], p_T[i], True) <= -MAX_MISS_DISTANCE
+            ):
                 continue
-            overlap = _overlap(table, upper, lower, p_T[j], p_T[i], same_height)
-            if not same_height:
-                if overlap > MAX_OVERLAP and fault == NO_FAULT:
-                    fault, faulty_object = OVERLAPPING, j
-                continue
-            is_near |= overlap > -MAX_MISS_DISTANCE
-            is_above |= overlap > 0
-            if overlap <= 0:
+            may_touch = False
+            for a in range(table[upper].first_part, table[upper].last_part):
+                for b in range(table[lower].first_part, table[lower].last_part):
+                    part_bottom_z = p_T[j, 2] + table[a].bottom_z
+                    top_z = p_T[i, 2] + table[b].top_z
+                    same_height = (
+                        table[a].bottom_count > 0 and abs(part_bottom_z - top_z) < MAX_CONTACT_GAP
+                    )
+                    height_overlap = min(p_T[j, 2] + table[a].top_z, top_z) - max(
+                        part_bottom_z, p_T[i, 2] + table[b].bottom_z
+                    )
+                    if not same_height and height_overlap <= MAX_OVERLAP:
+                        continue
+                    overlap = _overlap(table, a, b, p_T[j], p_T[i], same_height)
+                    if not same_height:
+                        if overlap > MAX_OVERLAP and fault == NO_FAULT and not is_apart[i, j]:
+                            fault, faulty_object, other_object = OVERLAPPING, j, i
+                        continue
+                    is_near |= overlap > -MAX_MISS_DISTANCE
+                    # Level faces that are not in contact carry nothing.
+                    is_above |= overlap > 0 and (not is_joined or table[b].top_count == 0)
+                    may_touch |= overlap > 0
+            if not may_touch:
                 continue
             # Faces as large as the footprints are in contact where the footprints overlap.
             both_flat = table[upper].flat and table[lower].flat
@@ -313,4 +414,4 @@ def find_contacts(table, shapes, p_T, half_size):  # type: ignore[no-untyped-def
         if not supported and fault == NO_FAULT:
             faulty_object = j
             fault = EDGE if is_above else UNSUPPORTED if is_near else FLOATING
-    return fault, faulty_object, pairs[:count], stack
+    return fault, faulty_object, other_object, pairs[:count], stack

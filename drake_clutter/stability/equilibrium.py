@@ -117,12 +117,18 @@ def _is_stable_tower(table, shapes, p_T, pairs, margin):  # type: ignore[no-unty
     """Return whether a stack stands in which each object has one contact below.
 
     Then the loads add up from the top. The result is also False if an object has several contacts
-    below, or lies on a cylinder; these cases need the solver.
+    below, lies on a cylinder, or touches another one that is not convex; these cases need the
+    solver.
     """
     n = len(shapes)
     below = np.full(n, -2)
     for lower, upper in pairs:
         if below[upper] != -2 or (lower >= 0 and table[shapes[lower]].rolls):
+            return False
+        if lower >= 0 and (
+            table[shapes[lower]].first_part != shapes[lower]
+            or table[shapes[upper]].first_part != shapes[upper]
+        ):
             return False
         below[upper] = lower
     force, moment = np.empty(n), np.empty((n, 2))  # of the object and all that it carries

@@ -1,9 +1,10 @@
-"""Ray casting at convex objects: depth images, masks and visible fractions.
+"""Ray casting at objects: depth images, masks and visible fractions.
 
 The rays go through the centers of the pixels. The rays that meet a face fill a convex polygon of
 the image, row by row, and on a face the inverse depth is linear in the pixel, so a ray costs one
 addition and one comparison. Besides the objects, only the plane of the support's floor is cast,
-not its walls. Objects that reach behind the camera are ignored.
+not its walls. Objects that reach behind the camera are ignored. Objects that are not convex are
+cast as the union of their convex pieces.
 """
 
 import math
@@ -56,7 +57,8 @@ def _cast_object(arrays, shape, p_TO, camera, label, nearest, hit):  # type: ign
         hit: Object of the largest inverse depth. Shape (height, width).
 
     Returns:
-        Number of rays that meet the object, whatever is in front of it.
+        Number of rays that meet the object, whatever is in front of it. A ray through several
+        pieces of an object counts several times.
     """
     height, width = hit.shape
     p_TC = camera.p_TC
@@ -164,6 +166,18 @@ def _cast_floor(nearest, along, down, start):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def _count_rays(arrays, shape, p_TO, camera, window, nearest, hit):  # type: ignore[no-untyped-def]
+    """Return the number of rays that meet an object of several convex pieces.
+
+    It overwrites the window of the image.
+    """
+    nearest[window[0] : window[1], window[2] : window[3]] = 0
+    hit[window[0] : window[1], window[2] : window[3]] = -1
+    _cast_object(arrays, shape, p_TO, camera, np.int16(0), nearest, hit)
+    return (hit[window[0] : window[1], window[2] : window[3]] == 0).sum()
+
+
+@njit(cache=True)
 def _cast_scene(arrays, shapes, p_T, camera, nearest, hit, unoccluded, visible):  # type: ignore[no-untyped-def]
     """Find the first object that each ray meets, and count rays.
 
@@ -189,6 +203,9 @@ def _cast_scene(arrays, shapes, p_T, camera, nearest, hit, unoccluded, visible):
         if window[1] > 0:
             row_begin, row_end = min(row_begin, window[0]), max(row_end, window[1])
             column_begin, column_end = min(column_begin, window[2]), max(column_end, window[3])
+    for i in range(len(shapes)):
+        if windows[i, 1] > 0 and arrays.table[shapes[i]].first_part != shapes[i]:
+            unoccluded[i] = _count_rays(arrays, shapes[i], p_T[i], camera, windows[i], nearest, hit)
     along, down, start = _inverse_depth(camera, 0.0, 0.0, 1.0, -camera.p_TC[2])
     for row in range(row_begin, row_end):
         nearest[row, column_begin:column_end] = start
@@ -198,9 +215,9 @@ def _cast_scene(arrays, shapes, p_T, camera, nearest, hit, unoccluded, visible):
         _cast_floor(nearest[row_begin:row_end, column_begin:column_end], along, down, first)
     for i in range(len(shapes)):
         if windows[i, 1] > 0:
-            unoccluded[i] = _cast_object(
-                arrays, shapes[i], p_T[i], camera, np.int16(i), nearest, hit
-            )
+            rays = _cast_object(arrays, shapes[i], p_T[i], camera, np.int16(i), nearest, hit)
+            if arrays.table[shapes[i]].first_part == shapes[i]:
+                unoccluded[i] = rays
     for i in range(len(shapes)):
         label = np.int16(i)
         total = 0
@@ -248,7 +265,7 @@ def _occluders_by_ray(arrays, shapes, p_T, camera, target, nearest, hit):  # typ
 
 
 class RayCaster:
-    """Casts a camera's rays at scenes of convex objects.
+    """Casts a camera's rays at scenes of objects.
 
     Attributes:
         camera: The camera.
@@ -308,7 +325,7 @@ class RayCaster:
         scene. Objects outside of the image have fraction 1.
 
         Args:
-            objects: Convex objects.
+            objects: The objects.
         """
         fractions = self.visible_fractions_of_rows(*self._shapes.rows_and_positions(objects))
         return {o.name: fraction for o, fraction in zip(objects, fractions, strict=True)}

@@ -1,9 +1,11 @@
 """Flat tables of oriented object shapes for compiled functions.
 
 An oriented shape has the faces on which an object stands and carries, and its surface. Compiled
-functions need only a row of the table and a position for each object.
+functions need only a row of the table and a position for each object. An object that is not convex
+has further rows, one for each convex piece.
 """
 
+import itertools
 from collections.abc import Sequence
 from enum import IntEnum
 from functools import cache
@@ -27,6 +29,8 @@ MAX_LEVEL_ANGLE = np.radians(1.5)
 """A face or axis farther from level than this leans [rad]."""
 RIM_CORNERS = 16
 """Corners of a can's rim, as in Drake's contact mesh; the most of any face."""
+MAX_LEVEL_DIFFERENCE = 0.002
+"""Faces of an object whose heights differ by less than this form one bottom or top [m]."""
 STRIP_HALF_WIDTH = 0.006
 """Half the width of the strip on which a lying cylinder rests [m].
 
@@ -52,7 +56,6 @@ class Fault(IntEnum):
 
     NONE = 0
     LEANING = 1
-    NOT_CONVEX = 2
 
 
 class _Surface(NamedTuple):
@@ -103,12 +106,13 @@ def _ring(radius: float, z: float, sides: int) -> Floats:
 
 
 @cache
-def _surface(object_class: ObjectClass) -> _Surface:
-    """Return the surface of a class in O."""
-    if object_class.shape is not Shape.CYLINDER:
-        return _hull_surface(object_class.corners)
-    radius, half = object_class.size[0] / 2, object_class.size[2] / 2
-    return _hull_surface(np.vstack([_ring(radius, z, _SURFACE_SIDES) for z in (-half, half)]))
+def _piece_surfaces(object_class: ObjectClass) -> tuple[_Surface, ...]:
+    """Return the surfaces of the convex pieces of a class in O."""
+    if object_class.shape is Shape.CYLINDER:
+        radius, half = object_class.size[0] / 2, object_class.size[2] / 2
+        rings = [_ring(radius, z, _SURFACE_SIDES) for z in (-half, half)]
+        return (_hull_surface(np.vstack(rings)),)
+    return tuple(_hull_surface(piece) for piece in object_class.convex_pieces)
 
 
 def _convex_outline(points: Floats, max_corners: int) -> Floats:
@@ -140,6 +144,8 @@ class OrientedShape(NamedTuple):
         top_z: Height of the top face's center, or of the highest point [m].
         footprint: Corners of the outline seen from above, counter-clockwise [m]. Shape (C, 2).
         surface: The surface, with axes rotated to those of T.
+        parts: Its convex pieces; none for a convex object. A piece has a bottom only if the object
+            stands on it.
     """
 
     fault: Fault
@@ -151,20 +157,20 @@ class OrientedShape(NamedTuple):
     top_z: float
     footprint: Floats
     surface: _Surface
+    parts: "tuple[OrientedShape, ...]" = ()
 
 
 def orient_shape(object_class: ObjectClass, quaternion: Sequence[float]) -> OrientedShape:
     """Return a class in an orientation, given as a quaternion (w, x, y, z) of R_TO."""
     R_TO = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
-    surface = _surface(object_class)
-    corner = surface.corner @ R_TO.T
-    normal = surface.normal @ R_TO.T
-    empty = np.empty((0, 3))
-    bottom = empty
-    top = empty
-    rolls = False
+    com = R_TO @ object_class.center_of_mass
+    surfaces = [
+        surface._replace(corner=surface.corner @ R_TO.T, normal=surface.normal @ R_TO.T)
+        for surface in _piece_surfaces(object_class)
+    ]
+    if len(surfaces) > 1:
+        return _join_parts([_orient_piece(surface, com) for surface in surfaces])
     if object_class.shape is Shape.CYLINDER and abs(R_TO[2, 2]) < np.sin(MAX_LEVEL_ANGLE):
-        rolls = True
         up = np.array([0.0, 0.0, object_class.size[0] / 2])
         axis = object_class.size[2] / 2 * R_TO[:, 2]
         half_width = STRIP_HALF_WIDTH * np.cross([0.0, 0.0, 1.0], R_TO[:, 2])
@@ -173,34 +179,99 @@ def orient_shape(object_class: ObjectClass, quaternion: Sequence[float]) -> Orie
             np.array([axis + half_width, half_width - axis, -axis - half_width, axis - half_width])
             - up
         )
-    else:
-        level = np.flatnonzero(np.abs(normal[:, 2]) > np.cos(MAX_LEVEL_ANGLE))
-        faces = {
-            face: corner[surface.counts[:face].sum() :][: surface.counts[face]] for face in level
-        }
-        below = [face for face in faces if normal[face, 2] < 0]
-        above = [face for face in faces if normal[face, 2] > 0]
-        bottom = faces[max(below, key=lambda face: _area(faces[face]))] if below else empty
-        top = faces[max(above, key=lambda face: _area(faces[face]))] if above else empty
-    fault = Fault.NONE if len(bottom) else Fault.LEANING
-    if len(object_class.convex_pieces) > 1:
-        fault = Fault.NOT_CONVEX
+        return _oriented_shape(surfaces[0], com, bottom, top, rolls=True)
+    return _orient_piece(surfaces[0], com)
+
+
+def _orient_piece(surface: _Surface, com: Floats) -> OrientedShape:
+    """Return a convex piece, given its surface and the object's center of mass (3,) in T's axes."""
+    level = np.flatnonzero(np.abs(surface.normal[:, 2]) > np.cos(MAX_LEVEL_ANGLE))
+    ends = np.cumsum(surface.counts)
+    faces = [surface.corner[ends[face] - surface.counts[face] : ends[face]] for face in level]
+    below = [face for face, index in zip(faces, level, strict=True) if surface.normal[index, 2] < 0]
+    above = [face for face, index in zip(faces, level, strict=True) if surface.normal[index, 2] > 0]
+    bottom, top = _lowest_faces(below, 1), _lowest_faces(above, -1)
+    return _oriented_shape(surface, com, bottom, top, rolls=False)
+
+
+def _lowest_faces(faces: Sequence[Floats], sign: int) -> Floats:
+    """Return the corners of the faces that are level with the lowest one [m]. Shape (C, 3).
+
+    The base of a scanned object consists of several faces.
+
+    Args:
+        faces: Level faces. Shapes (C, 3).
+        sign: 1 for the lowest faces, -1 for the highest ones.
+    """
+    if not faces:
+        return np.empty((0, 3))
+    heights = np.array([sign * face[:, 2].mean() for face in faces])
+    return np.vstack(
+        [
+            face
+            for face, height in zip(faces, heights, strict=True)
+            if height < heights.min() + MAX_LEVEL_DIFFERENCE
+        ]
+    )
+
+
+def _oriented_shape(
+    surface: _Surface, com: Floats, bottom: Floats, top: Floats, *, rolls: bool
+) -> OrientedShape:
+    """Return a shape with the given corners of bottom (C, 3) and top (C, 3) in the axes of T."""
+    empty = np.empty((0, 2))
+    corner = surface.corner
     return OrientedShape(
-        fault,
+        Fault.NONE if len(bottom) else Fault.LEANING,
         rolls,
-        com=R_TO @ object_class.center_of_mass,
-        bottom=_convex_outline(bottom, RIM_CORNERS) if len(bottom) else empty[:, :2],
+        com=com,
+        bottom=_convex_outline(bottom, RIM_CORNERS) if len(bottom) else empty,
         top=top[:, :2] if len(top) < 3 else _convex_outline(top, RIM_CORNERS),
         bottom_z=float(bottom[:, 2].mean() if len(bottom) else corner[:, 2].min()),
         top_z=float(top[:, 2].mean() if len(top) else corner[:, 2].max()),
         footprint=_convex_outline(corner, _FOOTPRINT_CORNERS),
-        surface=surface._replace(corner=corner, normal=normal),
+        surface=surface,
     )
 
 
-def _area(face: Floats) -> float:
-    """Return the area of a planar polygon (C, 3) [m^2]."""
-    return float(np.linalg.norm(np.cross(face[1:-1] - face[0], face[2:] - face[0]).sum(axis=0)) / 2)
+def _join_parts(parts: Sequence[OrientedShape]) -> OrientedShape:
+    """Return an object of several convex pieces.
+
+    It stands on the pieces whose bottoms are level with its lowest point. Its bottom and top are
+    the outlines of those that are lowest and highest.
+    """
+    counts = np.concatenate([part.surface.counts for part in parts])
+    surface = _Surface(
+        np.vstack([part.surface.corner for part in parts]),
+        counts,
+        np.vstack([part.surface.normal for part in parts]),
+    )
+    lowest = surface.corner[:, 2].min()
+    highest = surface.corner[:, 2].max()
+    feet = [len(p.bottom) > 0 and p.bottom_z < lowest + MAX_LEVEL_DIFFERENCE for p in parts]
+    bottom = [
+        np.column_stack([part.bottom, np.full(len(part.bottom), part.bottom_z)])
+        for part in itertools.compress(parts, feet)
+    ]
+    top = [
+        np.column_stack([part.top, np.full(len(part.top), part.top_z)])
+        for part in parts
+        if len(part.top) and part.top_z > highest - MAX_LEVEL_DIFFERENCE
+    ]
+    no_face = np.empty((0, 3))
+    joined = _oriented_shape(
+        surface,
+        parts[0].com,
+        np.vstack([*bottom, no_face]),
+        np.vstack([*top, no_face]),
+        rolls=False,
+    )
+    no_corner = np.empty((0, 2))
+    pieces = [
+        part if is_foot else part._replace(bottom=no_corner)
+        for part, is_foot in zip(parts, feet, strict=True)
+    ]
+    return joined._replace(parts=tuple(pieces))
 
 
 SHAPE_DTYPE = np.dtype(
@@ -224,6 +295,8 @@ SHAPE_DTYPE = np.dtype(
         ("footprint_count", np.int64),
         ("first_face", np.int64),
         ("last_face", np.int64),
+        ("first_part", np.int64),
+        ("last_part", np.int64),
     ]
 )
 """Record of an `OrientedShape`, with these further fields.
@@ -235,6 +308,7 @@ footprint_radius: Radius of the circle about the origin that contains the footpr
 sides: Outward normal of each side of the footprint, and its distance from the origin [m].
 bottom_count, top_count, footprint_count: Numbers of corners in use.
 first_face, last_face: Range of its faces in the table; the end is excluded.
+first_part, last_part: Range of the rows of its convex pieces; its own row for a convex object.
 """
 
 
@@ -281,11 +355,13 @@ class ShapeTable:
     def _start(self) -> None:
         """Empty the table."""
         self._row_by_shape: dict[tuple[ObjectClass, tuple[float, float, float, float]], int] = {}
+        self._num_rows = 0
+        self._num_faces = 0
         self.arrays = _allocate(64, 512, 4096)
 
     def find_rows(self, objects: Sequence[SceneObject]) -> Ints:
         """Return the table's row of each object. Shape (n,)."""
-        if len(self._row_by_shape) > _MAX_ROWS:
+        if self._num_rows > _MAX_ROWS:
             self._start()
             self.generation += 1
         row_by_shape = self._row_by_shape
@@ -308,14 +384,31 @@ class ShapeTable:
         )
 
     def _add(self, scene_object: SceneObject) -> None:
-        """Add the shape of an object as a new row."""
-        shape = orient_shape(scene_object.object_class, scene_object.X_TO.quaternion)
-        row = len(self._row_by_shape)
-        face = int(self.arrays.table["last_face"].max())
+        """Add the shape of an object as a new row, and its convex pieces as further rows."""
+        object_class = scene_object.object_class
+        shape = orient_shape(object_class, scene_object.X_TO.quaternion)
+        row = self._add_row(shape, object_class)
+        for part in shape.parts:
+            # Rays meet the faces of the object, so its pieces need none.
+            no_faces = part.surface._replace(
+                counts=np.empty(0, np.int64), corner=np.empty((0, 3)), normal=np.empty((0, 3))
+            )
+            self._add_row(part._replace(surface=no_faces), object_class)
+        record = self.arrays.table[row]
+        record["first_part"] = row + 1 if shape.parts else row
+        record["last_part"] = self._num_rows
+        record["lower"] = shape.surface.corner.min(axis=0)
+        record["upper"] = shape.surface.corner.max(axis=0)
+        self._row_by_shape[object_class, scene_object.X_TO.quaternion] = row
+
+    def _add_row(self, shape: OrientedShape, object_class: ObjectClass) -> int:
+        """Add a shape as a new row, and return its number."""
+        row = self._num_rows
+        face = self._num_faces
         corner = self.arrays.first_corner[face]
         last_face = face + len(shape.surface.counts)
         last_corner = corner + len(shape.surface.corner)
-        if (
+        while (
             row >= len(self.arrays.table)
             or last_face >= len(self.arrays.normal)
             or last_corner > len(self.arrays.corner)
@@ -333,12 +426,10 @@ class ShapeTable:
         record["fault"] = shape.fault
         record["rolls"] = shape.rolls
         record["com"] = shape.com
-        record["flat"] = scene_object.object_class.shape is not Shape.MESH and not shape.rolls
-        record["lower"] = shape.surface.corner.min(axis=0)
-        record["upper"] = shape.surface.corner.max(axis=0)
+        record["flat"] = object_class.shape is not Shape.MESH and not shape.rolls
         record["bottom_z"] = shape.bottom_z
         record["top_z"] = shape.top_z
-        record["mass"] = scene_object.object_class.mass
+        record["mass"] = object_class.mass
         record["footprint_radius"] = np.linalg.norm(shape.footprint, axis=1).max()
         for name, corners in (
             ("bottom", shape.bottom),
@@ -359,4 +450,6 @@ class ShapeTable:
         table.first_corner[face + 1 : last_face + 1] = corner + np.cumsum(shape.surface.counts)
         table.normal[face:last_face] = shape.surface.normal
         table.corner[corner:last_corner] = shape.surface.corner
-        self._row_by_shape[scene_object.object_class, scene_object.X_TO.quaternion] = row
+        self._num_rows = row + 1
+        self._num_faces = last_face
+        return row

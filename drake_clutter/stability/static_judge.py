@@ -7,7 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drake_clutter.catalog import Shape
 from drake_clutter.config import ClutterConfig
+from drake_clutter.scenes.geometry import penetration_depth
 from drake_clutter.scenes.interfaces import (
     InconclusiveReason,
     InconclusiveVerdict,
@@ -45,7 +47,6 @@ _KEY_BYTES_PER_OBJECT = 32
 """Bytes of a row of the description that `equilibrium.canonical_order` returns."""
 _INCONCLUSIVE_REASONS = {
     contacts.LEANING: InconclusiveReason.LEANING,
-    contacts.NOT_CONVEX: InconclusiveReason.NOT_CONVEX,
     contacts.OUTSIDE: InconclusiveReason.OUTSIDE_TRAY,
     contacts.OVERLAPPING: InconclusiveReason.INTERPENETRATING,
     contacts.FLOATING: InconclusiveReason.FLOATING,
@@ -73,10 +74,11 @@ class _ContactGraph(NamedTuple):
 class StaticStabilityJudge:
     """Judges scenes by quasi-static equilibrium and ray casting (a `SceneJudge`).
 
-    Objects must be convex, level, and in contact as laid-out or settled scenes are; the verdict on
-    other scenes is inconclusive. Contact areas are shrunk by a margin, the most that the random
-    offsets of two objects can remove. Results are cached by stack, independent of its position on
-    the support, so that after a change only the changed stacks are solved again.
+    Objects must be level, and in contact as laid-out or settled scenes are; the verdict on other
+    scenes is inconclusive. Objects that are not convex are judged by their convex pieces. Contact
+    areas are shrunk by a margin, the most that the random offsets of two objects can remove.
+    Results are cached by stack, independent of its position on the support, so that after a change
+    only the changed stacks are solved again.
 
     Attributes:
         ray_caster: The caster for the camera, which shares the table of shapes.
@@ -358,9 +360,23 @@ class StaticStabilityJudge:
         self, scene: Scene, shapes: Ints, p_T: Floats
     ) -> _ContactGraph | InconclusiveVerdict:
         """Return the contacts of a scene, or why the model does not cover it."""
-        fault, faulty, pairs, stack = contacts.find_contacts(
-            self._shapes.arrays.table, shapes, p_T, scene.support.half_size
-        )
+        objects = scene.objects
+        is_apart = np.zeros((len(objects), len(objects)), np.bool_)
+        while True:
+            fault, faulty, other, pairs, stack = contacts.find_contacts(
+                self._shapes.arrays.table, shapes, p_T, scene.support.half_size, is_apart
+            )
+            # Pieces of meshes that overlap in height and seen from above may still be apart, as
+            # what lies in a bowl.
+            if (
+                fault != contacts.OVERLAPPING
+                or other < 0
+                or Shape.MESH
+                not in (o.object_class.shape for o in (objects[faulty], objects[other]))
+                or penetration_depth(objects[faulty], objects[other]) > contacts.MAX_OVERLAP
+            ):
+                break
+            is_apart[faulty, other] = is_apart[other, faulty] = True
         if fault != contacts.NO_FAULT:
             return InconclusiveVerdict(_INCONCLUSIVE_REASONS[fault], scene.objects[faulty].name)
         return _ContactGraph(shapes, p_T, pairs, stack)
