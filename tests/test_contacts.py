@@ -157,8 +157,9 @@ def found_contacts(
     """Return fault, faulty object, contacts and stack numbers on a tray of 0.9 m by 0.7 m."""
     shapes = ShapeTable()
     rows, p_T = shapes.rows_and_positions(objects)
-    fault, faulty, pairs, stack = contacts.find_contacts(
-        shapes.arrays.table, rows, p_T, np.array([0.45, 0.35])
+    is_apart = np.zeros((len(rows), len(rows)), np.bool_)
+    fault, faulty, _, pairs, stack = contacts.find_contacts(
+        shapes.arrays.table, rows, p_T, np.array([0.45, 0.35]), is_apart
     )
     return int(fault), int(faulty), pairs.tolist(), stack.tolist()
 
@@ -193,3 +194,17 @@ def test_faults_beside_a_box(other: SceneObject, fault: int) -> None:
     assert found[0] == fault
     if fault in (contacts.OUTSIDE, contacts.FLOATING, contacts.UNSUPPORTED):
         assert found[1] == 1
+
+
+def test_objects_that_are_known_to_be_apart_do_not_overlap() -> None:
+    """Two boxes overlap by 2 mm seen from above; the fault names both."""
+    objects = [resting("cracker_box", name="first"), resting("cracker_box", xy=(0.0, 0.158))]
+    shapes = ShapeTable()
+    rows, p_T = shapes.rows_and_positions(objects)
+    is_apart = np.zeros((2, 2), np.bool_)
+    arguments = (shapes.arrays.table, rows, p_T, np.array([0.45, 0.35]), is_apart)
+    fault, *pair, _, _ = contacts.find_contacts(*arguments)
+    assert fault == contacts.OVERLAPPING
+    assert sorted(pair) == [0, 1]
+    is_apart[:] = True
+    assert contacts.find_contacts(*arguments)[0] == contacts.NO_FAULT

@@ -184,6 +184,7 @@ def test_summary_of_a_small_batch() -> None:
         "solvable_share": 2 / 3,
         "balanced_share": 0.5,
         "classes": {"cracker_box": 1, "sugar_box": 6, "tomato_soup_can": 2},
+        "absent_classes": ["pudding_box", "gelatin_box", "master_chef_can", "large_marker"],
         "distinct_share": 0.75,
         "mean_stacks": (2 + 2 + 1 + 1) / 4,
         "mean_objects": (2 + 2 + 2 + 3) / 4,
