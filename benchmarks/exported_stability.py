@@ -1,14 +1,16 @@
 """Measure whether exported stable scenes stay at rest in MuJoCo and PyBullet.
 
-    python benchmarks/exported_stability.py --out exported_stability.json
+    python benchmarks/exported_stability.py FOLDER --workers 2 --out exported_stability.json
 
 Takes shipped stable scenes of every generator at their settled poses, exports them, and simulates
 each in both simulators. A scene stays if no object is ever farther than `MAX_DISPLACEMENT` from
-where it was. An interrupted run is resumed by the same command.
+where it was. FOLDER keeps the displacements; an interrupted run is resumed by the same command.
 """
 
 import tempfile
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -19,17 +21,17 @@ import typer
 from numpy.typing import NDArray
 
 from benchmarks.measurement import describe_machine
-from benchmarks.pybullet_world import TIME_STEP, load_world
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.export import ExportFormat, export_scene
+from drake_clutter.export.sdf_writer import PYBULLET_FILE
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.statistics import wilson_interval
-from training.results_file import ResultsFile, Row, provenance
-from training.script import SCENES, print_table, progress, run_script
+from training.results_file import ResultsFile, Row, collect_records, provenance
+from training.script import SCENES, ResultsOption, WorkersOption, print_table, run_script
 
-DATASETS = ("rg_25", "sg_star_25", "sg_14")
+DATASETS = ("rg_25", "hill_climbing_25", "sg_25", "sg_star_25", "sg_14")
 """One dataset of each generator."""
 MAX_DISPLACEMENT = 0.010
 """Largest displacement of an object that counts as at rest [m]."""
@@ -37,8 +39,13 @@ DURATION = 10.0
 """Simulated time [s]."""
 SAMPLE_PERIOD = 0.1
 """Time between two measurements of the displacements [s]."""
-SOLVER_ITERATIONS = 200
-"""Iterations of PyBullet's solver in a step. Its default of 50 does not hold tall stacks."""
+PYBULLET_TIME_STEP = 0.001
+"""Time step of PyBullet [s].
+
+With its default of 1/240 s, the solver does not converge for heavy stacks on lying markers.
+"""
+PYBULLET_ITERATIONS = 100
+"""Iterations of PyBullet's solver in a step; its default is 50."""
 
 
 def simulate_mujoco(scene: Scene, duration: float) -> float:
@@ -58,19 +65,22 @@ def simulate_mujoco(scene: Scene, duration: float) -> float:
 
 def simulate_pybullet(scene: Scene, duration: float) -> float:
     """Return the largest displacement of an object in PyBullet [m]."""
-    with tempfile.TemporaryDirectory() as folder:
-        load_world(export_scene(scene, ExportFormat.SDF, Path(folder)))
-    pybullet.setPhysicsEngineParameter(numSolverIterations=SOLVER_ITERATIONS)
-
-    def advance() -> None:
-        for _ in range(round(SAMPLE_PERIOD / TIME_STEP)):
-            pybullet.stepSimulation()
-
-    def positions() -> NDArray[np.float64]:
-        bodies = range(1, 1 + len(scene.objects))  # Body 0 is the tray.
-        return np.array([pybullet.getBasePositionAndOrientation(body)[0] for body in bodies])
-
+    pybullet.connect(pybullet.DIRECT)
     try:
+        with tempfile.TemporaryDirectory() as folder:
+            path = export_scene(scene, ExportFormat.SDF, Path(folder)).with_name(PYBULLET_FILE)
+            _, *objects = pybullet.loadSDF(str(path))
+        pybullet.setGravity(0, 0, -9.81)
+        pybullet.setTimeStep(PYBULLET_TIME_STEP)
+        pybullet.setPhysicsEngineParameter(numSolverIterations=PYBULLET_ITERATIONS)
+
+        def advance() -> None:
+            for _ in range(round(SAMPLE_PERIOD / PYBULLET_TIME_STEP)):
+                pybullet.stepSimulation()
+
+        def positions() -> NDArray[np.float64]:
+            return np.array([pybullet.getBasePositionAndOrientation(body)[0] for body in objects])
+
         return _max_displacement(advance, positions, duration)
     finally:
         pybullet.disconnect()
@@ -96,24 +106,67 @@ def _max_displacement(
 
 SIMULATORS = {"mujoco": simulate_mujoco, "pybullet": simulate_pybullet}
 """Simulations by the name of the simulator's package."""
+HEADER = {
+    "max_displacement_mm": 1000 * MAX_DISPLACEMENT,
+    "duration_s": DURATION,
+    "pybullet_time_step_s": PYBULLET_TIME_STEP,
+    "pybullet_solver_iterations": PYBULLET_ITERATIONS,
+}
+"""What all measurements have in common."""
 
 
-def measure(name: str, simulator: str, count: int) -> Row:
+@dataclass(frozen=True)
+class Displacement:
+    """Result of one simulation.
+
+    Attributes:
+        index: Index of the scene in its dataset.
+        displacement_mm: Largest displacement of an object [mm].
+    """
+
+    index: int
+    displacement_mm: float
+
+
+class SceneSimulation:
+    """Simulates scenes of a dataset; a worker for `map_ordered`."""
+
+    def __init__(self, name: str, simulator: str) -> None:
+        """Load the dataset.
+
+        Args:
+            name: Name of the dataset.
+            simulator: Key of `SIMULATORS`.
+        """
+        self._dataset = load_scene_dataset(SCENES / f"{name}.json", load_catalog())
+        self._simulate = SIMULATORS[simulator]
+
+    def __call__(self, index: int) -> Displacement:
+        """Return the displacement in the scene of an index."""
+        scene = self._dataset.settled_scene(index, self._dataset.grammar, ClutterConfig())
+        return Displacement(index, round(1000 * self._simulate(scene, DURATION), 3))
+
+
+def measure(name: str, simulator: str, count: int, folder: Path, workers: int) -> Row:
     """Return how many scenes of a dataset stay at rest in a simulator.
 
     Args:
         name: Name of the dataset.
         simulator: Key of `SIMULATORS`.
         count: Number of scenes, the first of the dataset.
+        folder: Folder of the record files.
+        workers: Number of processes.
     """
     dataset = load_scene_dataset(SCENES / f"{name}.json", load_catalog())
-    grammar = dataset.grammar
-    config = ClutterConfig()
-    displacements = [
-        SIMULATORS[simulator](dataset.settled_scene(index, grammar, config), DURATION)
-        for index in progress(range(count), f"{name} in {simulator}")
-    ]
-    stays = [displacement <= MAX_DISPLACEMENT for displacement in displacements]
+    records = collect_records(
+        folder / f"{name}_{simulator}.jsonl",
+        HEADER | {"sha256": dataset.sha256, "simulator": simulator},
+        partial(SceneSimulation, name, simulator),
+        range(count),
+        workers=workers,
+    )
+    displacements = [record["displacement_mm"] for record in records]
+    num_at_rest = sum(displacement <= 1000 * MAX_DISPLACEMENT for displacement in displacements)
     return {
         "dataset": name,
         "sha256": dataset.sha256,
@@ -121,39 +174,29 @@ def measure(name: str, simulator: str, count: int) -> Row:
         "seed": dataset.metadata["seed"],
         "simulator": simulator,
         "scenes": count,
-        "at_rest": sum(stays),
-        "at_rest_share": sum(stays) / count,
-        "at_rest_ci95": wilson_interval(sum(stays), count),
-        "displacements_mm": [round(1000 * d, 3) for d in displacements],
+        "at_rest": num_at_rest,
+        "at_rest_share": num_at_rest / count,
+        "at_rest_ci95": wilson_interval(num_at_rest, count),
+        "displacements_mm": displacements,
         **describe_machine(simulator),
         **provenance(),
     }
 
 
 def main(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the record files.")],
     count: Annotated[int, typer.Option(min=1, max=100, help="Scenes of each dataset.")] = 100,
-    out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Results file to write (JSON).")
-    ] = None,
+    workers: WorkersOption = 1,
+    out: ResultsOption = None,
 ) -> None:
     """Simulate the scenes of all datasets in both simulators."""
-    header = {
-        "max_displacement_mm": 1000 * MAX_DISPLACEMENT,
-        "duration_s": DURATION,
-        "pybullet_time_step_s": TIME_STEP,
-        "pybullet_solver_iterations": SOLVER_ITERATIONS,
-    }
-    results = ResultsFile(out, header, ("dataset", "simulator", "scenes")) if out else None
-    rows = []
-    for name in DATASETS:
-        for simulator in SIMULATORS:
-            key = {"dataset": name, "simulator": simulator, "scenes": count}
-            row = results.find(key) if results else None
-            if row is None:
-                row = measure(name, simulator, count)
-                if results:
-                    results.add(row)
-            rows.append(row)
+    rows = [
+        measure(name, simulator, count, folder, workers)
+        for simulator in SIMULATORS
+        for name in DATASETS
+    ]
+    if out:
+        ResultsFile(out, HEADER, ("dataset", "simulator")).add(*rows)
     print_table(
         [
             {

@@ -101,6 +101,7 @@ PARSED = {
     "evaluate_detector",
     "evaluate_explorers",
     "evaluate_generators",
+    "exported_stability",
     "judge_agreement",
     "random_generator_calibration",
 }

@@ -177,6 +177,21 @@ def check_in_pybullet(scene: Scene, main_file: Path, client: int) -> None:
         ] == pytest.approx(scene[name].X_TO.p[2], abs=0.015)
 
 
+def test_cylinders_have_their_size_in_pybullet(bullet: int, tmp_path: Path) -> None:
+    """PyBullet inflates cylinders by 1 mm, for which the exported ones are smaller."""
+    cylinders = [
+        resting("large_marker", xy=(0.2, 0.0)),
+        resting("tomato_soup_can", Orientation.UPRIGHT_0),
+        resting("tomato_soup_can", Orientation.FLAT_0, (-0.2, 0.0), name="lying can"),
+    ]
+    path = export_scene(scene_of(*cylinders), ExportFormat.SDF, tmp_path)
+    tray, *bodies = pybullet.loadSDF(str(path.with_name(PYBULLET_FILE)), physicsClientId=bullet)
+    for body in bodies:
+        contacts = pybullet.getClosestPoints(tray, body, 0.01, physicsClientId=bullet)
+        # PyBullet's cylinders are prisms of 32 sides, up to 0.5 % of the radius smaller.
+        assert min(contact[8] for contact in contacts) == pytest.approx(0.0, abs=2e-4)
+
+
 def check_in_mujoco(scene: Scene, main_file: Path) -> None:
     model = mujoco.MjModel.from_xml_path(str(main_file))
     data = mujoco.MjData(model)

@@ -15,6 +15,7 @@ import results_arm
 import results_calibration
 import results_closed_loop
 import results_exploration
+import results_export
 import results_generation
 import results_index
 import results_intervals
@@ -32,6 +33,7 @@ RESULTS = {
         results_calibration,
         results_closed_loop,
         results_exploration,
+        results_export,
         results_generation,
         results_index,
         results_intervals,

@@ -17,6 +17,7 @@ import results_arm
 import results_calibration
 import results_closed_loop
 import results_exploration
+import results_export
 import results_generation
 import results_index
 import results_intervals
@@ -38,6 +39,7 @@ PAGES: Mapping[str, Callable[[], str]] = {
     "results/judge_agreement.md": results_judge_agreement.page,
     "results/calibration.md": results_calibration.page,
     "results/intervals.md": results_intervals.page,
+    "results/export.md": results_export.page,
     "results/negative_results.md": results_negative.page,
     **{
         f"reference/api/{name}.md": partial(api_page.package_page, name)

@@ -16,6 +16,7 @@ PAGES = (
     ("judge_agreement.md", "Judge agreement", "Static stability judge compared with Drake; speed"),
     ("calibration.md", "Calibration", "Random scenes compared with the paper's"),
     ("intervals.md", "Confidence intervals", "Methods, and their coverage for few values"),
+    ("export.md", "Exported scenes", "Stable scenes in MuJoCo and PyBullet"),
     ("negative_results.md", "Negative results", "What did not help"),
 )
 """File, title and content of the other pages of results."""

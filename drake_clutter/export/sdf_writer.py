@@ -24,6 +24,11 @@ PYBULLET_FILE = "scene_pybullet.sdf"
 
 PyBullet reads friction from an element of its own only, which strict readers of SDFormat reject.
 """
+_PYBULLET_MARGIN = 0.001
+"""Distance by which PyBullet inflates cylinders and meshes that it reads from a file [m].
+
+It is `gUrdfDefaultCollisionMargin` in Bullet's `BulletUrdfImporter.cpp`. Boxes keep their size.
+"""
 
 
 def _use_standard_friction(collision: ElementTree.Element, rolling_friction: float) -> None:
@@ -70,6 +75,17 @@ def _add_pybullet_friction(model: ElementTree.Element) -> None:
         ElementTree.SubElement(contact, "rolling_friction").text = repr(scaled)
 
 
+def _deflate_cylinders(model: ElementTree.Element) -> None:
+    """Make the cylinders of a model smaller by PyBullet's margin, which lifts stacks otherwise."""
+    for cylinder in model.iterfind("link/collision/geometry/cylinder"):
+        for name, margins in (("radius", 1), ("length", 2)):
+            element = cylinder.find(name)
+            assert element is not None
+            size = float(element.text or "") - margins * _PYBULLET_MARGIN
+            if size > 0:  # else it is thinner than the margin, and stays inflated
+                element.text = repr(size)
+
+
 def _model(text: str, name: str, rolling_friction: float = 0.0) -> ElementTree.Element:
     """Return the model of an SDF document under another name, with standard friction."""
     model = ElementTree.fromstring(text).find("model")
@@ -89,8 +105,8 @@ def _pose_text(pose: Pose) -> str:
 def write_sdf(scene: Scene, folder: Path) -> Path:
     """Write a world with one model per object, and meshes per class.
 
-    `scene_pybullet.sdf` is `scene.sdf` with friction as PyBullet reads it. Returns the path of
-    `scene.sdf`.
+    `scene_pybullet.sdf` is `scene.sdf` with friction and cylinders as PyBullet reads them. Returns
+    the path of `scene.sdf`.
     """
     # Without this, the prefix would be renamed, and Drake would not recognize it.
     ElementTree.register_namespace("drake", _DRAKE)
@@ -119,5 +135,6 @@ def write_sdf(scene: Scene, folder: Path) -> Path:
     write_xml(path, root)
     for model in world.iter("model"):
         _add_pybullet_friction(model)
+        _deflate_cylinders(model)
     write_xml(folder / PYBULLET_FILE, root)
     return path
