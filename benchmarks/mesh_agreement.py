@@ -23,7 +23,7 @@ import numpy as np
 import trimesh
 import typer
 
-from benchmarks.collect_drake_verdicts import Record, SceneBatch, SceneSettler
+from benchmarks.collect_drake_verdicts import Record, SceneBatch, SceneSettler, SceneVerdict
 from benchmarks.judge_agreement import BatchComparison, Confusion
 from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.assets import build_assets
@@ -155,7 +155,9 @@ def main(
         header: dict[str, Any] = key | {"config": to_plain(batch.config)}
         path = folder / f"{batch.name}.jsonl.gz"
         settler = partial(SceneSettler, batch)
-        records = collect_records(path, header, settler, range(count), workers=workers)
+        records = collect_records(
+            path, header, settler, range(count), schema=SceneVerdict, workers=workers
+        )
         comparison = BatchComparison(batch)
         comparison.run(records)
         rows.append(
