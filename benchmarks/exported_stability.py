@@ -9,7 +9,6 @@ where it was. FOLDER keeps the displacements; an interrupted run is resumed by t
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -19,6 +18,7 @@ import numpy as np
 import pybullet
 import typer
 from numpy.typing import NDArray
+from pydantic import BaseModel
 
 from benchmarks.measurement import describe_machine
 from drake_clutter.catalog import load_catalog
@@ -28,6 +28,7 @@ from drake_clutter.export.sdf_writer import PYBULLET_FILE
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.statistics import wilson_interval
+from drake_clutter.validation import CountOrZero, Finite
 from training.results_file import ResultsFile, Row, collect_records, provenance
 from training.script import SCENES, ResultsOption, WorkersOption, print_table, run_script
 
@@ -115,17 +116,11 @@ HEADER = {
 """What all measurements have in common."""
 
 
-@dataclass(frozen=True)
-class Displacement:
-    """Result of one simulation.
+class Displacement(BaseModel):
+    """Record of one simulation; see `SceneSimulation`."""
 
-    Attributes:
-        index: Index of the scene in its dataset.
-        displacement_mm: Largest displacement of an object [mm].
-    """
-
-    index: int
-    displacement_mm: float
+    index: CountOrZero
+    displacement_mm: Finite
 
 
 class SceneSimulation:
@@ -141,10 +136,16 @@ class SceneSimulation:
         self._dataset = load_scene_dataset(SCENES / f"{name}.json", load_catalog())
         self._simulate = SIMULATORS[simulator]
 
-    def __call__(self, index: int) -> Displacement:
-        """Return the displacement in the scene of an index."""
+    def __call__(self, index: int) -> Row:
+        """Return the record of the scene of an index.
+
+        Returns:
+            index: Index of the scene in its dataset.
+            displacement_mm: Largest displacement of an object [mm].
+        """
         scene = self._dataset.settled_scene(index, self._dataset.grammar, ClutterConfig())
-        return Displacement(index, round(1000 * self._simulate(scene, DURATION), 3))
+        displacement = self._simulate(scene, DURATION)
+        return {"index": index, "displacement_mm": round(1000 * displacement, 3)}
 
 
 def measure(name: str, simulator: str, count: int, folder: Path, workers: int) -> Row:
@@ -163,6 +164,7 @@ def measure(name: str, simulator: str, count: int, folder: Path, workers: int) -
         HEADER | {"sha256": dataset.sha256, "simulator": simulator},
         partial(SceneSimulation, name, simulator),
         range(count),
+        schema=Displacement,
         workers=workers,
     )
     displacements = [record["displacement_mm"] for record in records]
