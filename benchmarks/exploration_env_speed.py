@@ -22,7 +22,7 @@ from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.episode import SteppedBackend
 from drake_clutter.tasks.exploration_graph import build_exploration_graph
 from training.results_file import Row, provenance
-from training.script import ResultsOption, print_table, run_script
+from training.script import ResultsOption, print_table, progress, run_script
 
 SCENES = "training/scenes/sg_star_25.json"
 """Scene dataset whose graphs are laid out anew in every episode."""
@@ -108,7 +108,7 @@ def main(
     out: ResultsOption = None,
 ) -> None:
     """Measure the environment with both kinds of observations."""
-    rows = [measure(privileged, episodes) for privileged in (False, True)]
+    rows = [measure(privileged, episodes) for privileged in progress((False, True), "observations")]
     print_table([table_row(row) for row in rows])
     if out is not None:
         write_json(out, {"rows": rows, "machine": describe_machine(), **provenance()})

@@ -21,7 +21,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.files import write_json
 from drake_clutter.tasks.generation_task import ClutterGeneration, GenerationTaskConfig
 from training.results_file import Row, provenance
-from training.script import ResultsOption, print_table, run_script
+from training.script import ResultsOption, print_table, progress, run_script
 
 PARTS: dict[str, tuple[Any, Callable[..., Any]]] = {
     "environments": (ClutterGeneration, ClutterGeneration.step),
@@ -93,7 +93,8 @@ def main(
 ) -> None:
     """Measure the training with one thread, two threads, and so on."""
     limit_operations_to_one_thread()
-    rows = [measure(threads, steps) for threads in range(1, NUM_GRADIENT_SHARDS + 1)]
+    threads = range(1, NUM_GRADIENT_SHARDS + 1)
+    rows = [measure(number, steps) for number in progress(threads, "numbers of threads")]
     print_table([table_row(row) for row in rows])
     if out is not None:
         machine = describe_machine("torch")

@@ -302,7 +302,8 @@ def measure_sensitivity(batch: SceneBatch, records: Sequence[Record]) -> list[Ro
     """Return the agreement on scenes with other margins and friction coefficients."""
     scenes = [batch.lay_out(record["index"])[0] for record in records]
     rows = []
-    for margin, friction in itertools.product(MARGINS, FRICTIONS):
+    settings = list(itertools.product(MARGINS, FRICTIONS))
+    for margin, friction in progress(settings, "margins and friction coefficients"):
         judge = StaticStabilityJudge(batch.config, margin, friction)
         confusion = Confusion()
         for scene, record in zip(scenes, records, strict=True):

@@ -4,9 +4,11 @@
     python benchmarks/pick_place.py timing --count 20 --out timing.json
     python benchmarks/pick_place.py grasp-constraints --count 20 --out grasp_constraints.json
 
-The moves are random legal moves in stable scenes of the random generator.
+The moves are random legal moves in stable scenes of the random generator. An interrupted `moves`
+is resumed by the same command; the other two, which measure times, start again.
 """
 
+import itertools
 import math
 import time
 from collections import Counter
@@ -36,6 +38,7 @@ from drake_clutter.planning.time_parameterization import (
     parameterize_time_optimal,
     sample_path,
 )
+from drake_clutter.records import partial_records
 from drake_clutter.scenes.interfaces import Move, Observation, PickPlaceCommand
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import Scene
@@ -47,8 +50,7 @@ from drake_clutter.station.station_simulation import PickPlaceResult, StationSim
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.tasks.belief import legal_moves
 from drake_clutter.validation import to_plain
-from drake_clutter.workers.parallel_map import map_ordered
-from training.results_file import provenance
+from training.results_file import collect_records, provenance
 from training.script import SeedOption, WorkersOption, progress, run_script
 
 OutOption = Annotated[Path, typer.Option(metavar="FILE", help="Results file to write (JSON).")]
@@ -108,6 +110,17 @@ class Trial:
     tracking: float = math.nan
     clearance: float = math.nan
     unstable_anyway: bool = False
+
+
+@dataclass(frozen=True)
+class SceneTrials:
+    """Record of a scene.
+
+    Attributes:
+        trials: Its moves.
+    """
+
+    trials: tuple[Trial, ...]
 
 
 def execution_result(result: PickPlaceResult) -> str:
@@ -215,7 +228,7 @@ class MoveTester:
         self._executor = ArmExecutor(CONFIG)
         self._unoptimized = ArmExecutor(CONFIG, planner_config=PlannerConfig(optimize=False))
 
-    def __call__(self, number: int) -> list[Trial]:
+    def __call__(self, number: int) -> SceneTrials:
         """Return the trials in the scene of a number."""
         scene, rng = self._scenes(number), item_rng(self._seed, number, 1)
         observation = self._detector.perceive(scene).observation
@@ -224,7 +237,7 @@ class MoveTester:
             # The model is cached, as in an episode: it does not count as planning time.
             executor.planner_for(scene.support).collision_model(scene.objects)
         order = rng.permutation(len(moves))[:MOVES_PER_SCENE]
-        return [self._test(scene, moves[k], rng, observation) for k in order]
+        return SceneTrials(tuple(self._test(scene, moves[k], rng, observation) for k in order))
 
     def _test(
         self, scene: Scene, move: Move, rng: np.random.Generator, observation: Observation
@@ -300,20 +313,26 @@ def moves(
 ) -> None:
     """Plan and simulate random legal moves."""
     numbers = range(math.ceil(count / MOVES_PER_SCENE))
-    by_scene = map_ordered(partial(MoveTester, nodes, seed), numbers, workers=workers)
-    trials = [trial for part in progress(by_scene, "scenes", len(numbers)) for trial in part]
-    trials = trials[:count]
+    setting = {"cell": to_plain(default_cell()), "planner": asdict(PlannerConfig())}
+    with partial_records(out) as path:
+        header = {"nodes": nodes, "seed": seed, "config": to_plain(CONFIG), **setting}
+        make_worker = partial(MoveTester, nodes, seed)
+        records = collect_records(
+            path, header, make_worker, numbers, schema=SceneTrials, workers=workers
+        )
+        trials = [Trial(**trial) for record in records for trial in record["trials"]]
+        command = f"moves --count {count} --nodes {nodes} --seed {seed} --workers {workers}"
+        fields = {"command": f"benchmarks/pick_place.py {command}", "seed": seed, "count": count}
+        write_results(out, fields | setting | summarize_trials(trials[:count]))
+
+
+def summarize_trials(trials: Sequence[Trial]) -> dict[str, Any]:
+    """Return the results of moves."""
     planned = [t for t in trials if not math.isnan(t.motion)]
     carried_out = [t for t in planned if t.result == CARRIED_OUT]
     fair = [t for t in planned if not t.unstable_anyway]
     num_shorter_segments = sum(len(t.shortened) for t in planned)
-    command = f"moves --count {count} --nodes {nodes} --seed {seed} --workers {workers}"
-    fields = {
-        "command": f"benchmarks/pick_place.py {command}",
-        "seed": seed,
-        "count": count,
-        "cell": to_plain(default_cell()),
-        "planner": asdict(PlannerConfig()),
+    return {
         "results": Counter(t.result for t in trials),
         "not_planned_by_class": Counter(
             f"{t.object_class}: {t.result}" for t in trials if math.isnan(t.motion)
@@ -337,7 +356,6 @@ def moves(
         "tracking_rad": quantiles([t.tracking for t in planned]),
         "least_clearance_m": min((t.clearance for t in planned), default=math.nan),
     }
-    write_results(out, fields)
 
 
 def timing(
@@ -401,10 +419,9 @@ def timing(
         stopwatch.measure("simulation, run", lambda: simulation.execute(plan))
         return True
 
-    number = num_planned = 0
-    while num_planned < count:
-        num_planned += measure_move(number)
-        number += 1
+    measured = filter(measure_move, itertools.count())
+    for _ in progress(itertools.islice(measured, count), "moves", count):
+        pass
     seconds = {name: quantiles(values) for name, values in stopwatch.seconds.items()}
     command = f"benchmarks/pick_place.py timing --count {count} --seed {seed}"
     write_results(out, {"command": command, "seed": seed, "count": count, "seconds": seconds})
@@ -420,14 +437,10 @@ def grasp_constraints(
     rows = list[dict[str, Any]]()
     for kind, nodes in (("one object", 4), ("25 nodes", NODES)):
         sample_move = MoveSampler(nodes, seed)
-        plans = list[tuple[Scene, PickPlacePlan]]()
-        number = 0
-        while len(plans) < count:
-            move = sample_move(number)
-            number += 1
-            plan = executor.plan(move.scene, move.command) if move else None
-            if move is not None and isinstance(plan, PickPlacePlan):
-                plans.append((move.scene, plan))
+        moves = filter(None, map(sample_move, itertools.count()))
+        planned = ((move.scene, executor.plan(move.scene, move.command)) for move in moves)
+        found = ((scene, plan) for scene, plan in planned if isinstance(plan, PickPlacePlan))
+        plans = list(progress(itertools.islice(found, count), f"{kind}, plans", count))
         for constraint in ("WeldGrasp", "CompliantGrasp"):
             results = list[PickPlaceResult]()
             walls = list[float]()

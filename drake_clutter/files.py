@@ -1,15 +1,17 @@
-"""Atomic writing of files, output folders, and errors in user input."""
+"""Atomic writing of files, and errors in user input."""
 
 import errno
 import hashlib
 import json
 import os
+import re
 import reprlib
 import secrets
 import stat
 import sys
 import tempfile
 from collections.abc import Iterator
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -32,7 +34,8 @@ _STORAGE_ERRORS = frozenset(
     }
 )
 """Errors of the file system that have their cause in the machine, not in the program."""
-
+_TEMPORARY_NAME = re.compile(r"\.(?P<stem>.+)\.tmp-[0-9a-f]{8}(?P<suffix>(\.[^.]*)?)")
+"""Name of a `temporary_path`."""
 
 MAX_ERROR_LENGTH = 500
 """Largest number of characters of a whole error message; more than a terminal shows at a glance."""
@@ -193,8 +196,8 @@ def format_value(value: Any) -> str:
 def cli_error_handler() -> Iterator[None]:
     """Print an error that the user can mend as one line and exit with code 2.
 
-    These are an `InputError`, and files that cannot be written. An interruption has a line of its
-    own and exit code 130.
+    These are an `InputError`, files that cannot be written, and worker processes that are killed
+    again and again. An interruption has a line of its own and exit code 130.
     """
     try:
         yield
@@ -207,6 +210,9 @@ def cli_error_handler() -> Iterator[None]:
         place = error.filename2 or error.filename or "a file"  # the second one is a target
         problem = f"cannot be written or read ({os.strerror(error.errno)})"
         print(f"error {place}: {problem}; finished results are kept", file=sys.stderr)
+        sys.exit(2)
+    except BrokenProcessPool as error:
+        print(f"error {_single_line(str(error))}; finished results are kept", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         _print_interruption()
@@ -222,14 +228,30 @@ def _print_interruption() -> None:
     print("interrupted; finished results are kept", file=sys.stderr)
 
 
+def temporary_path(path: Path) -> Path:
+    """Return a path beside a file or folder at which it is made before it gets its name."""
+    # The random part separates processes. The suffix is kept for writers that infer the format.
+    return path.with_name(f".{path.stem}.tmp-{secrets.token_hex(4)}{path.suffix}")
+
+
+def is_temporary(entry: Path, path: Path | None = None) -> bool:
+    """Return whether a path is a `temporary_path`.
+
+    Args:
+        entry: The path.
+        path: File or folder whose temporary path it may be; None for any.
+    """
+    match = _TEMPORARY_NAME.fullmatch(entry.name)
+    return match is not None and path in (None, entry.with_name(match["stem"] + match["suffix"]))
+
+
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
     """Yield a temporary path, which replaces `path` when the block ends without an error.
 
     An `OSError` without a file name, such as that of a full disk, gets the name of `path`.
     """
-    # The random part separates processes. The suffix is kept for writers that infer the format.
-    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
+    temporary = temporary_path(path)
     try:
         yield temporary
         os.replace(temporary, path)
@@ -250,41 +272,6 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, value: Any) -> None:
     """Write a value as indented JSON atomically; NaN and infinity are errors."""
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
-
-
-def prepare_output_directory(path: Path, *, allowed_entries: frozenset[str] = frozenset()) -> Path:
-    """Create an output folder, or check an existing one.
-
-    Args:
-        path: The folder, which is created with its parents if it does not exist.
-        allowed_entries: Names that the folder may contain, for example those of a run that is
-            resumed.
-
-    Returns:
-        The folder.
-
-    Raises:
-        InputError: The path is not a folder, not writable, or contains other entries.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise InputError(f"--out {path}: is a file; give a folder that is new or empty") from error
-    except OSError as error:
-        raise InputError(
-            f"--out {path}: cannot be created ({error.strerror}); give a writable folder"
-        ) from error
-    if not os.access(path, os.W_OK | os.X_OK):
-        raise InputError(f"--out {path}: is not writable; give a writable folder")
-    unexpected_entries = sorted(
-        entry.name for entry in path.iterdir() if entry.name not in allowed_entries
-    )
-    if unexpected_entries:
-        raise InputError(
-            f"--out {path}: is not empty (holds {unexpected_entries[0]}); "
-            "give a folder that is new or empty"
-        )
-    return path
 
 
 def private_temporary_folder(purpose: str) -> Path:

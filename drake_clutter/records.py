@@ -6,16 +6,16 @@ are in an uncompressed file beside it, the journal, so that an interrupted run l
 line that it was writing. The journal is compressed and removed when the computation ends.
 """
 
-import fcntl
 import gzip
 import json
-import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
+from io import FileIO
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from drake_clutter.files import InputError, atomic_write, input_error, parse_json, reading_file
+from drake_clutter.outputs import output_file
 from drake_clutter.resources import git_commit
 from drake_clutter.validation import validate
 
@@ -56,6 +56,27 @@ def write_jsonl(path: Path, header: Any, records: Iterable[Any]) -> None:
     _write_compressed(path, [f"{json.dumps(line)}\n" for line in (header, *records)])
 
 
+@contextmanager
+def partial_records(out: Path) -> Iterator[Path]:
+    """Keep the records of a computation whose output file is written in one piece at the end.
+
+    Args:
+        out: The output file.
+
+    Yields:
+        Path of a record file, from which the same computation goes on after an interruption. It is
+        removed when the block ends without an error.
+    """
+    path = out.with_name(f"{out.name}.partial.jsonl")
+    try:
+        yield path
+    except BaseException:
+        if len(read_jsonl(path)) < 2:  # nothing but the header
+            path.unlink(missing_ok=True)
+        raise
+    path.unlink(missing_ok=True)
+
+
 def resume_jsonl(
     path: Path,
     header: Mapping[str, Any],
@@ -81,10 +102,9 @@ def resume_jsonl(
             another process is appending to it.
     """
     header = json.loads(json.dumps(header))
-    path.parent.mkdir(parents=True, exist_ok=True)
     with _open_journal(path) as journal:
         with reading_file(path, _CONTENT):
-            text = journal.read()
+            text = journal.readall().decode()
         lines, compressed = _complete_lines(text), _compressed_lines(path)
         if len(lines) < len(compressed) or not lines:
             lines = compressed or [json.dumps({**header, "commit": git_commit()}) + "\n"]
@@ -93,8 +113,7 @@ def resume_jsonl(
             upgraded = upgrade_header(written_header)
         if text != "".join(lines):
             journal.truncate(0)
-            journal.write("".join(lines))
-            journal.flush()
+            _append(journal, "".join(lines))
         differing = ", ".join(key for key, value in header.items() if upgraded.get(key) != value)
         if differing:
             raise InputError(
@@ -105,8 +124,7 @@ def resume_jsonl(
         yield from records
         for record in make_records(len(records)):
             line = json.dumps(record)
-            journal.write(f"{line}\n")
-            journal.flush()
+            _append(journal, f"{line}\n")
             yield json.loads(line)
 
 
@@ -149,34 +167,29 @@ def _write_compressed(path: Path, lines: Iterable[str]) -> None:
 
 
 @contextmanager
-def _open_journal(path: Path) -> Iterator[TextIO]:
-    """Open and lock the journal of a record file; at the end, compress and remove it."""
+def _open_journal(path: Path) -> Iterator[FileIO]:
+    """Open the journal of a record file; at the end, compress and remove it."""
     journal_path = _journal_path(path)
-    with _open_locked(journal_path, path) as journal:
+    # Without a buffer, no text remains to be written if the disk is full.
+    with output_file(path), journal_path.open("ab+", buffering=0) as journal:
+        journal.seek(0)
         try:
             yield journal
         finally:
             if journal_path != path:
                 journal.seek(0)
-                lines = _complete_lines(journal.read())
+                lines = _complete_lines(journal.readall().decode())
                 if len(lines) > len(_compressed_lines(path)):
                     _write_compressed(path, lines)
                 journal_path.unlink()
 
 
-def _open_locked(journal_path: Path, path: Path) -> TextIO:
-    """Return the journal at its start, locked against other processes."""
-    while True:
-        journal = journal_path.open("a+", encoding="utf-8")
-        try:
-            fcntl.flock(journal, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            journal.close()
-            raise InputError(
-                f"{path}: another process is appending to it; wait for it, or use another folder"
-            ) from error
-        with suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(journal.fileno()), journal_path.stat()):
-                journal.seek(0)
-                return journal
-        journal.close()  # The process that held the lock before has removed this file.
+def _append(journal: FileIO, text: str) -> None:
+    """Append a text to a journal; an `OSError` names the file."""
+    data = memoryview(text.encode())
+    try:
+        while data:
+            data = data[journal.write(data) :]
+    except OSError as error:
+        error.filename = str(journal.name)
+        raise

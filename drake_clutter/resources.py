@@ -38,7 +38,15 @@ def git_commit() -> str:
     results = (":(top,exclude)training/results", ":(top,exclude)benchmarks/results")
     try:
         commit = _git("describe", "--always")
-        modified_files = _git("status", "--porcelain", "--untracked-files=no", "--", ":/", *results)
+        modified_files = _git(
+            "--no-optional-locks",
+            "status",
+            "--porcelain",
+            "--untracked-files=no",
+            "--",
+            ":/",
+            *results,
+        )
     except (OSError, subprocess.SubprocessError):
         return "unknown"
     return f"{commit}-dirty" if modified_files else commit

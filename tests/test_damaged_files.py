@@ -30,6 +30,7 @@ from test_scene_file import DOCUMENT, SCENE
 from test_scene_file_fuzzed import SCENARIO, places
 
 from drake_clutter.agents.behavior_cloning import BehaviorCloningConfig, BehaviorCloningLearner
+from drake_clutter.agents.episode_evaluation import EpisodeResult
 from drake_clutter.agents.explorer_network import ExplorerNetwork
 from drake_clutter.agents.learned_explorer import STUDENT, LearnedExplorerFactory, explorer_metadata
 from drake_clutter.agents.learned_generator import (
@@ -72,7 +73,7 @@ from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.generation_task import ClutterGeneration, GenerationTaskConfig
 from drake_clutter.validation import load_config_as, to_plain
 from drake_clutter.yaml_io import to_yaml
-from training.evaluate_explorers import EpisodeRecord, to_result
+from training.evaluate_explorers import EpisodeRecord
 from training.results_file import ResultsFile
 
 NUM_MUTANTS = int(os.environ.get("DAMAGED_FILES", "100"))
@@ -372,8 +373,14 @@ def cloning_training(folder: Path) -> Reader:
 def job_file(folder: Path) -> Reader:
     cells = {"default": DEFAULT_CELL}
     job = FeasibilityJob((Path("scene.yaml"),), cells, (), 0, ClutterConfig(), None).to_dict()
-    open_job_folder(folder, job)
-    return Reader([folder / JOB_FILE], lambda: open_job_folder(folder, job))
+    with open_job_folder(folder, job):
+        (folder / "moves.csv").touch()
+
+    def read() -> None:
+        with open_job_folder(folder, job):
+            pass
+
+    return Reader([folder / JOB_FILE], read)
 
 
 def progress_file(folder: Path) -> Reader:
@@ -444,7 +451,7 @@ def record_file(folder: Path) -> Reader:
 
     def read() -> None:
         for episode in read_jsonl(path, EpisodeRecord)[1:]:
-            to_result(episode)
+            EpisodeResult.from_record(episode)
         with closing(
             resume_jsonl(path, header, lambda done: [record] * (3 - done), EpisodeRecord)
         ) as lines:

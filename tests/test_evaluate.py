@@ -1,7 +1,8 @@
 """Evaluation of exploration policies: which episodes are run, and which input is refused."""
 
+import itertools
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from typer.testing import CliRunner
 from drake_clutter.cli import app
 from drake_clutter.commands.evaluate_explorers import (
     EvaluationScene,
+    ExplorerEvaluation,
     common_cell,
     evaluate_explorers,
     load_evaluation_scenes,
@@ -33,11 +35,12 @@ def run_evaluation(
 ) -> list[dict[str, Any]]:
     """Return the statistics; there must be at most `max_episodes` episodes."""
 
-    def progress(results: Iterable[Any], total: int) -> Iterable[Any]:
-        assert total <= max_episodes
+    def progress(results: Iterable[Any], num_done: int, total: int) -> Iterable[Any]:
+        assert total - num_done <= max_episodes
         return results
 
-    return evaluate_explorers(scenes, agents, 3, "static", 0, config, None, 1, out, progress)
+    evaluation = ExplorerEvaluation(scenes, agents, 3, "static", 0, config, None)
+    return evaluate_explorers(evaluation, 1, out, progress)
 
 
 def test_a_repeated_policy_is_run_once() -> None:
@@ -61,6 +64,33 @@ def test_invalid_input_is_refused_before_any_episode(tmp_path: Path) -> None:
             run_evaluation(scenes, "random", out=out, max_episodes=0)
     with pytest.raises(InputError, match="was not trained with cereal_box_large"):
         run_evaluation(scenes, "random", "student", max_episodes=0)
+
+
+def test_an_interrupted_evaluation_is_resumed_and_a_finished_one_read(tmp_path: Path) -> None:
+    scenes = load_evaluation_scenes("sg_star_10", None)[:3]
+    whole, out = tmp_path / "whole.json", tmp_path / "out.json"
+    rows = run_evaluation(scenes, "random", out=whole)
+
+    def interrupt(results: Iterable[Any], num_done: int, total: int) -> Iterator[Any]:
+        yield from itertools.islice(results, 2)
+        raise KeyboardInterrupt
+
+    evaluation = ExplorerEvaluation(scenes, ["random"], 3, "static", 0, CONFIG, None)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate_explorers(evaluation, 1, out, interrupt)
+    partial = tmp_path / "out.json.partial.jsonl"
+    assert len(partial.read_text().splitlines()) == 1 + 2
+    assert run_evaluation(scenes, "random", out=out, max_episodes=1) == rows
+    assert out.read_bytes() == whole.read_bytes()
+    read = run_evaluation(scenes, "random", out=out, max_episodes=0)
+    assert read == json.loads(json.dumps(rows))
+    assert sorted(tmp_path.iterdir()) == [out, whole]
+    with pytest.raises(InputError, match=r"holds other results \(agents\); give a new file, or"):
+        run_evaluation(scenes, "largest-first", out=out, max_episodes=0)
+    out.write_text("mine")
+    with pytest.raises(InputError, match="is not JSON"):
+        run_evaluation(scenes, "random", out=out, max_episodes=0)
+    assert out.read_text() == "mine"
 
 
 def test_scenes_without_objects_hidden_from_the_camera_are_excluded() -> None:

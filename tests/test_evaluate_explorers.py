@@ -84,7 +84,7 @@ def test_episodes_are_run_once(tmp_path: Path) -> None:
     assert script.collect_episodes(path, scenes, "random", 1, **options) == records
     assert path.read_bytes() == before
     assert script.collect_episodes(path, scenes, "random", 2, **options)[:1] == records
-    assert script.to_result(records[0]).hidden == scenes.scenes[0].num_hidden
+    assert EpisodeResult.from_record(records[0]).hidden == scenes.scenes[0].num_hidden
     with pytest.raises(
         InputError,
         match=r"random\.jsonl\.gz: holds records with a different header \(agent, seed\)",

@@ -1,15 +1,12 @@
-"""Atomic writing of files, and checks of output folders."""
+"""Atomic writing of files."""
 
 import json
-import os
 from pathlib import Path
 
 import pytest
 
 from drake_clutter.files import (
-    InputError,
     atomic_write,
-    prepare_output_directory,
     write_json,
     write_text,
 )
@@ -66,42 +63,3 @@ def test_two_writers_use_different_temporary_files(tmp_path: Path) -> None:
         first.write_text("first")
         second.write_text("second")
     assert path.read_text() == "first"  # the outer block ends last
-
-
-def test_prepare_output_directory_creates_missing_folders(tmp_path: Path) -> None:
-    path = tmp_path / "a" / "b"
-    assert prepare_output_directory(path) == path
-    assert path.is_dir()
-    assert prepare_output_directory(path) == path
-
-
-def test_prepare_output_directory_accepts_allowed_entries(tmp_path: Path) -> None:
-    (tmp_path / "scenes").mkdir()
-    (tmp_path / "summary.json").touch()
-    assert (
-        prepare_output_directory(
-            tmp_path, allowed_entries=frozenset({"scenes", "summary.json", "more"})
-        )
-        == tmp_path
-    )
-    with pytest.raises(InputError, match=r"is not empty \(holds summary\.json\)"):
-        prepare_output_directory(tmp_path, allowed_entries=frozenset({"scenes"}))
-    with pytest.raises(InputError, match="give a folder that is new or empty"):
-        prepare_output_directory(tmp_path)
-
-
-def test_prepare_output_directory_rejects_a_file(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    for path in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(InputError, match=f"--out {path}: is a file"):
-            prepare_output_directory(path)
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write to any folder")
-def test_prepare_output_directory_rejects_a_folder_that_is_not_writable(tmp_path: Path) -> None:
-    locked = tmp_path / "locked"
-    locked.mkdir(mode=0o500)
-    with pytest.raises(InputError, match="is not writable"):
-        prepare_output_directory(locked)
-    with pytest.raises(InputError, match="cannot be created"):
-        prepare_output_directory(locked / "below")

@@ -12,7 +12,7 @@ PACKAGE = Path(drake_clutter.__file__).parent
 FLOORS = {
     0: {
         *("assets", "built_mesh", "catalog", "compilation", "files", "learning", "limits"),
-        *("mesh_file", "records", "resources", "seeding", "statistics"),
+        *("mesh_file", "outputs", "records", "resources", "seeding", "statistics"),
         *("validation", "workers", "yaml_io"),
     },
     1: {"cell", "config", "grammar"},

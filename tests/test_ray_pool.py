@@ -99,7 +99,7 @@ def test_items_of_killed_workers_are_repeated_a_limited_number_of_times(
     make_worker = partial(RandomNumbers, tmp_path, deadly=(0, 5), deadliest=12)
     results = map_ordered(make_worker, range(20), workers=2, ray_address=cluster.address)
     assert to_bytes(islice(results, 12)) == local_results
-    with pytest.raises(BrokenProcessPool, match="an item ended 3 worker processes"):
+    with pytest.raises(BrokenProcessPool, match="item 12: 3 worker processes ended"):
         next(results)
 
 

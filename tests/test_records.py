@@ -35,7 +35,7 @@ def test_records_are_made_once(name: str, tmp_path: Path) -> None:
     first = resume_jsonl(path, {"seed": 1}, maker)
     assert next(first)["seed"] == 1
     assert [next(first), next(first)] == [0, 1]
-    with pytest.raises(InputError, match="another process is appending to it"):
+    with pytest.raises(InputError, match=f"{name}: is in use by process"):
         next(resume_jsonl(path, {"seed": 1}, maker))
     assert read_jsonl(path)[1:] == [0, 1]
     first.close()

@@ -205,7 +205,7 @@ def evaluate_images(
     detector.detect(images[0].depth, images[0].color)  # The first call compiles code.
     parts = [
         detect_objects(image, detector, catalog, item_rng(seed, k))
-        for k, image in enumerate(images)
+        for k, image in enumerate(progress(images, "detections"))
     ]
     return DetectionMetrics(
         [o for part in parts for o in part.objects],

@@ -7,7 +7,7 @@ interrupted run is resumed by the same command.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -27,6 +27,7 @@ from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.pretrained import checkpoint_sha256
+from drake_clutter.outputs import output_file
 from drake_clutter.records import read_jsonl
 from drake_clutter.reports.terminal_text import evaluation_table_rows
 from drake_clutter.scenes.scene_dataset import SceneDataset, load_scene_dataset
@@ -139,12 +140,6 @@ def collect_episodes(
     return collect_records(path, header, player, episodes, schema=EpisodeRecord, workers=workers)
 
 
-def to_result(record: Mapping[str, Any]) -> EpisodeResult:
-    """Return a record as the result of an episode."""
-    values = {field.name: record[field.name] for field in fields(EpisodeResult)}
-    return EpisodeResult(**values | {"found_after": tuple(record["found_after"])})
-
-
 def summarize(
     results: Sequence[EpisodeResult],
     baselines: Mapping[str, Sequence[EpisodeResult]],
@@ -212,7 +207,7 @@ def evaluate_set(
         num_records = min(count, len(read_jsonl(path)) - 1)
         if num_records > 0:  # No episode of a baseline is run for a comparison.
             baseline = collect_episodes(path, scenes, agent, num_records, **options)
-            baselines[name] = [to_result(record) for record in baseline]
+            baselines[name] = [EpisodeResult.from_record(record) for record in baseline]
     solvable = [k for k, scene in enumerate(scenes.scenes[:count]) if scene.solvable == "solvable"]
     solvable_baselines = {
         name: [results[k] for k in solvable if k < len(results)]
@@ -221,7 +216,7 @@ def evaluate_set(
     max_objects = max(len(scene.settled_poses or ()) for scene in scenes.scenes)
     rows = []
     for agent in agents:
-        results = [to_result(record) for record in records[agent]]
+        results = [EpisodeResult.from_record(record) for record in records[agent]]
         solvable_results = [results[k] for k in solvable]
         rows.append(
             {
@@ -291,18 +286,21 @@ def main(
         for agent in agents or TABLES[name][1]:
             make_policy_factory(agent, ClutterConfig(), [c.name for c in scenes.classes])
     printed = list[dict[str, str]]()
-    for name, scenes in sets.items():
-        rows = evaluate_set(
-            scenes,
-            agents or TABLES[name][1],
-            folder,
-            min(count or len(scenes.scenes), len(scenes.scenes)),
-            fidelity=fidelity,
-            seed=seed,
-            workers=workers,
-        )
-        results[name].add(*rows)
-        printed += [cells for row in rows for cells in table_rows(row)]
+    with ExitStack() as locks:
+        for path in {file.path for file in results.values()} - {out}:  # `--out` is locked
+            locks.enter_context(output_file(path))
+        for name, scenes in sets.items():
+            rows = evaluate_set(
+                scenes,
+                agents or TABLES[name][1],
+                folder,
+                min(count or len(scenes.scenes), len(scenes.scenes)),
+                fidelity=fidelity,
+                seed=seed,
+                workers=workers,
+            )
+            results[name].add(*rows)
+            printed += [cells for row in rows for cells in table_rows(row)]
     print_table(printed)
 
 

@@ -21,12 +21,11 @@ alone: no scene dataset for evaluation is read.
 """
 
 import gc
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -37,11 +36,9 @@ from scipy.spatial.transform import Rotation
 
 from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.catalog import load_catalog
+from drake_clutter.commands.job_file import open_job_folder
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import InputError, prepare_output_directory, write_json
 from drake_clutter.perception.bop_models import (
-    DATASET_CAMERA_FILE,
-    MODELS_FOLDER,
     write_dataset_camera,
     write_models,
 )
@@ -63,8 +60,6 @@ from drake_clutter.validation import to_plain
 from drake_clutter.workers.parallel_map import map_ordered
 from training.script import CatalogOption, SeedOption, WorkersOption, progress, run_script
 
-JOB_FILE = "job.json"
-"""File in the dataset's folder with what determines the images."""
 HEAP_IMAGES = 20
 """Number of images of a heap."""
 GENERATED_IMAGES = 16
@@ -82,8 +77,6 @@ MOVE_PROBABILITY = 0.5
 _PLACEMENT_TRIES = 50
 _PLACEMENT_GAP = 0.005
 """Distance to other objects, seen from above, that a placement keeps [m]."""
-_EARLIER_JOB_FIELDS = {"dropped_share": "heap_fraction"}
-"""Fields of `ImageJob` by the names that version 0.1 wrote."""
 
 
 @dataclass(frozen=True)
@@ -343,21 +336,6 @@ def randomize_colors(
     return color.clip(0, 255).astype(np.uint8)
 
 
-def check_job(out: Path, job_fields: dict[str, Any]) -> None:
-    """Raise an InputError if a folder holds the images of another job."""
-    path = out / JOB_FILE
-    if not path.exists():
-        return
-    earlier = json.loads(path.read_text())
-    earlier = {_EARLIER_JOB_FIELDS.get(key, key): value for key, value in earlier.items()}
-    earlier = {"catalog": None, **earlier}  # Version 0.1 rendered shipped objects alone.
-    if earlier != job_fields:
-        raise InputError(
-            f"--out {out}: holds images of another job; expected a folder that is new or of the"
-            " same options"
-        )
-
-
 def main(
     out: Annotated[
         Path,
@@ -379,22 +357,19 @@ def main(
     """Render a dataset of labeled images."""
     job = ImageJob(objects, catalog.resolve() if catalog else None, heap_fraction, seed)
     job_fields = {**to_plain(job), "agents": [agent for agent, _ in job.generators()]}
-    shared_entries = {JOB_FILE, TRAIN_FOLDER, DATASET_CAMERA_FILE, MODELS_FOLDER}
-    prepare_output_directory(out, allowed_entries=frozenset(shared_entries))
-    check_job(out, job_fields)
-    write_json(out / JOB_FILE, job_fields)
-    write_dataset_camera(out, ClutterConfig().cell.camera)
-    write_models(out, list(load_catalog(job.catalog).classes.values()))
-    (out / TRAIN_FOLDER).mkdir(exist_ok=True)
-    present = {path.name for path in (out / TRAIN_FOLDER).iterdir()}
-    num_items = num_images = 0
-    while num_images < count:
-        num_images += job.num_images(num_items)
-        num_items += 1
-    missing = [item for item in range(num_items) if f"{item:06d}" not in present]
-    rendered = map_ordered(partial(ItemRenderer, job, out), missing, workers=workers)
-    for _ in progress(rendered, f"{num_images} images", num_items, num_items - len(missing)):
-        pass
+    with open_job_folder(out, job_fields):
+        write_dataset_camera(out, ClutterConfig().cell.camera)
+        write_models(out, list(load_catalog(job.catalog).classes.values()))
+        (out / TRAIN_FOLDER).mkdir(exist_ok=True)
+        present = {path.name for path in (out / TRAIN_FOLDER).iterdir()}
+        num_items = num_images = 0
+        while num_images < count:
+            num_images += job.num_images(num_items)
+            num_items += 1
+        missing = [item for item in range(num_items) if f"{item:06d}" not in present]
+        rendered = map_ordered(partial(ItemRenderer, job, out), missing, workers=workers)
+        for _ in progress(rendered, f"{num_images} images", num_items, num_items - len(missing)):
+            pass
 
 
 if __name__ == "__main__":

@@ -8,8 +8,10 @@ A script is a module with a function `main` of typed options and, at its end,
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
+from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import typer
 from rich.console import Console
@@ -18,6 +20,7 @@ from rich.table import Table
 
 from drake_clutter.files import cli_error_handler
 from drake_clutter.limits import MAX_SEED, MAX_WORKERS
+from drake_clutter.outputs import output_file
 
 Item = TypeVar("Item")
 
@@ -68,7 +71,8 @@ def settings_with_catalog(settings: Sequence[str] | None, catalog: Path | None) 
 def run_script(*commands: Callable[..., None]) -> None:
     """Run a script.
 
-    A misuse is reported in one line, with exit code 2.
+    A misuse is reported in one line, with exit code 2. Meanwhile the file that an option `--out
+    FILE` names is locked; a folder is locked by what writes to it.
 
     Args:
         commands: The functions whose parameters are the script's options. Of several, each is a
@@ -76,9 +80,25 @@ def run_script(*commands: Callable[..., None]) -> None:
     """
     app = typer.Typer(add_completion=False, no_args_is_help=len(commands) > 1)
     for command in commands:
-        app.command()(command)
+        app.command()(_with_locked_output(command))
     with cli_error_handler():
         app()
+
+
+def _with_locked_output(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command that keeps its output file locked."""
+    annotation = get_type_hints(command, include_extras=True).get("out")
+    options = getattr(annotation, "__metadata__", ())
+    if not any(option.metavar == "FILE" for option in options):
+        return command
+
+    @wraps(command)
+    def run(**values: Any) -> None:
+        out: Path | None = values["out"]
+        with output_file(out) if out else nullcontext():
+            command(**values)
+
+    return run
 
 
 def progress(

@@ -1,10 +1,10 @@
 """Evaluation of exploration policies on many scenes, reproducible with any number of workers."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -68,6 +68,12 @@ class EpisodeResult:
     moves: int
     found_after: tuple[int, ...]
     not_carried_out: int
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> Self:
+        """Return the result that a record, `asdict` as JSON, contains among other values."""
+        values = {field.name: record[field.name] for field in fields(cls)}
+        return cls(**values | {"found_after": tuple(record["found_after"])})
 
 
 class EpisodeRunner:

@@ -4,7 +4,6 @@ import io
 import math
 import os
 import re
-import secrets
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -39,7 +38,7 @@ from drake_clutter.catalog import (
     catalog_path,
     load_catalog,
 )
-from drake_clutter.files import InputError, write_text
+from drake_clutter.files import InputError, temporary_path, write_text
 from drake_clutter.mesh_file import (
     MAX_INVERTED_FRACTION,
     MAX_OVERLAP_FRACTION,
@@ -49,6 +48,7 @@ from drake_clutter.mesh_file import (
     load_object_mesh,
     measure_windings,
 )
+from drake_clutter.outputs import output_folder
 from drake_clutter.resources import resource_path
 
 _SHIPPED_PACKAGE = "drake_clutter_objects"
@@ -355,7 +355,7 @@ def build_class(object_class: ObjectClass, folder: Path, *, repair: bool = False
     mesh = _load_checked_mesh(object_class, repair)
     files = _make_asset_files(object_class, mesh)
     _check_built_files(object_class, files)
-    staging = folder / f".{object_class.name}.{secrets.token_hex(4)}"
+    staging = temporary_path(target)
     staging.mkdir(parents=True)
     try:
         for name, text in files.items():
@@ -422,14 +422,14 @@ def build_assets(
         )
     if not os.access(folder, os.W_OK):
         raise InputError(f"{folder}: is not writable; give an asset folder that you may write")
-    built = [
-        build_class(entry, folder, repair=repair)
-        for name, entry in own_classes.items()
-        if names is None or name in names
-    ]
     package = _SHIPPED_PACKAGE if folder == resource_path("sdf_assets") else folder.name
     description = "Object classes of drake_clutter: one folder per class."
-    write_text(
-        folder / "package.xml", _PACKAGE_XML.format(name=escape(package), description=description)
-    )
+    package_xml = _PACKAGE_XML.format(name=escape(package), description=description)
+    with output_folder(folder):
+        built = [
+            build_class(entry, folder, repair=repair)
+            for name, entry in own_classes.items()
+            if names is None or name in names
+        ]
+        write_text(folder / "package.xml", package_xml)
     return built

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.box import SIMPLE
@@ -22,7 +22,13 @@ from drake_clutter.cli.options import (
     SetOption,
     WorkersOption,
 )
-from drake_clutter.cli.output import escape_markup, out_console, print_json, progress_bar
+from drake_clutter.cli.output import (
+    Item,
+    escape_markup,
+    out_console,
+    print_json,
+    progress_bar,
+)
 from drake_clutter.files import InputError
 
 
@@ -51,7 +57,11 @@ def evaluate(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="JSON file to write, with statistics and all episodes."),
+        typer.Option(
+            metavar="FILE",
+            help="JSON file for statistics and all episodes: new, or of the same evaluation, "
+            "which is resumed.",
+        ),
     ] = None,
     max_moves: MaxMovesOption = None,
     fidelity: FidelityOption = Fidelity.SETTLE,
@@ -70,6 +80,7 @@ def evaluate(
     """Compare exploration policies on scenes with hidden objects."""
     from drake_clutter.agents.explorers import BASELINE_POLICIES
     from drake_clutter.commands.evaluate_explorers import (
+        ExplorerEvaluation,
         common_cell,
         evaluate_explorers,
         load_evaluation_scenes,
@@ -90,10 +101,7 @@ def evaluate(
     config = load_config_from_options(config_file, cell_file, settings, scene_cell)
     limit = max_moves or config.exploration.max_moves
 
-    def progress(results: Iterable[Any], total: int) -> Iterable[Any]:
-        return progress_bar("episodes", results, 0, total)
-
-    rows = evaluate_explorers(
+    evaluation = ExplorerEvaluation(
         evaluation_scenes,
         [name for names in agents or BASELINE_POLICIES for name in names.split(",")],
         limit,
@@ -101,11 +109,12 @@ def evaluate(
         seed,
         config,
         catalog,
-        workers,
-        out,
-        progress,
-        ray,
     )
+
+    def progress(results: Iterable[Item], num_done: int, total: int) -> Iterable[Item]:
+        return progress_bar("episodes", results, num_done, total)
+
+    rows = evaluate_explorers(evaluation, workers, out, progress, ray)
     if as_json:
         print_json(rows)
         return

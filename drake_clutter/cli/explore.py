@@ -16,7 +16,6 @@ from drake_clutter.cli.options import (
     SetOption,
 )
 from drake_clutter.cli.output import print_episode, print_transition
-from drake_clutter.files import prepare_output_directory
 
 
 def explore(
@@ -36,19 +35,28 @@ def explore(
 
     Writes `episode.json`, the final scene `after.yaml` and the web page `index.html`.
     """
-    from drake_clutter.commands.explore_scene import explore_scene, settle_scene, write_episode
+    from drake_clutter.agents.explorers import PRETRAINED_EXPLORERS
+    from drake_clutter.commands.explore_scene import (
+        EPISODE_FILE,
+        explore_scene,
+        settle_scene,
+        write_episode,
+    )
+    from drake_clutter.commands.job_file import open_job_folder, read_result, scene_job
+    from drake_clutter.learning.pretrained import checkpoint_sha256
 
     file, config = load_scene_and_config(scene, catalog, config_file, cell_file, settings)
-    prepare_output_directory(out)
-    task = explore_scene(
-        settle_scene(file.scene, config, seed),
-        agent,
-        fidelity.value,
-        max_moves or config.exploration.max_moves,
-        seed,
-        config,
-        print_transition,
-    )
-    title = f"{agent} explores {scene.name}"
-    episode = write_episode(out, task, title, agent, fidelity.value, seed, config)
+    limit = max_moves or config.exploration.max_moves
+    weights = checkpoint_sha256(agent, PRETRAINED_EXPLORERS)
+    options = {"agent": agent, "weights": weights, "fidelity": fidelity.value, "max_moves": limit}
+    job = scene_job("explore", scene, config, catalog, seed=seed, **options)
+    with open_job_folder(out, job):
+        episode = read_result(out / EPISODE_FILE)
+        if episode is None:
+            start = settle_scene(file.scene, config, seed)
+            task = explore_scene(
+                start, agent, fidelity.value, limit, seed, config, print_transition
+            )
+            title = f"{agent} explores {scene.name}"
+            episode = write_episode(out, task, title, agent, fidelity.value, seed, config)
     print_episode(episode, as_json, out)

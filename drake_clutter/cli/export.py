@@ -7,7 +7,6 @@ import typer
 
 from drake_clutter.cli.options import CatalogOption, InitialPosesOption, OutOption, SceneArgument
 from drake_clutter.cli.output import print_line
-from drake_clutter.files import prepare_output_directory
 
 
 class Format(Enum):
@@ -34,11 +33,15 @@ def export(
 ) -> None:
     """Export a scene to a self-contained folder."""
     from drake_clutter.catalog import load_catalog
+    from drake_clutter.commands.job_file import open_job_folder, scene_job
+    from drake_clutter.config import ClutterConfig
     from drake_clutter.export import ExportFormat, export_scene
     from drake_clutter.scenes.scene_file import load_scene
 
     file = load_scene(scene, load_catalog(catalog))
-    prepare_output_directory(out)
     exported = file.scene if initial_poses else file.settled_scene
-    path = export_scene(exported, ExportFormat(format.value), out)
+    config = ClutterConfig(cell=file.cell)
+    options = {"format": format.value, "initial_poses": initial_poses}
+    with open_job_folder(out, scene_job("export", scene, config, catalog, **options)):
+        path = export_scene(exported, ExportFormat(format.value), out)
     print_line(f"Wrote {path}.")

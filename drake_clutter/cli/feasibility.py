@@ -15,7 +15,7 @@ from drake_clutter.cli.options import (
     CatalogOption,
     ConfigOption,
     JsonOption,
-    ResumableOutOption,
+    OutOption,
     SeedOption,
     SetOption,
     WorkersOption,
@@ -41,7 +41,7 @@ def feasibility(
     scenes: Annotated[
         list[Path], typer.Argument(metavar="SCENES...", help="Scene files, or folders of them.")
     ],
-    out: ResumableOutOption,
+    out: OutOption,
     cell_files: Annotated[
         list[Path] | None,
         typer.Option("--cell", metavar="FILE", help="Work cell to study. May be repeated."),

@@ -13,8 +13,8 @@ from drake_clutter.cli.options import (
     JsonOption,
     NodesOption,
     ObjectsOption,
+    OutOption,
     RayOption,
-    ResumableOutOption,
     SeedOption,
     SetOption,
     WorkersOption,
@@ -24,7 +24,7 @@ from drake_clutter.limits import MAX_COUNT
 
 
 def generate(
-    out: ResumableOutOption,
+    out: OutOption,
     agent: Annotated[
         str,
         typer.Option(

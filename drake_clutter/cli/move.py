@@ -19,7 +19,7 @@ from drake_clutter.cli.options import (
     SetOption,
 )
 from drake_clutter.cli.output import print_episode, print_result, print_transition
-from drake_clutter.files import InputError, prepare_output_directory
+from drake_clutter.files import InputError
 
 
 def move(
@@ -54,12 +54,15 @@ def move(
     Writes `episode.json`, the final scene `after.yaml` and the web page `index.html`.
     """
     from drake_clutter.commands.explore_scene import (
+        EPISODE_FILE,
+        PLAN_FILE,
         execute_moves,
         plan_moves,
         read_moves,
         settle_scene,
         write_episode,
     )
+    from drake_clutter.commands.job_file import open_job_folder, read_result, scene_job
     from drake_clutter.reports.terminal_text import describe_plans
     from drake_clutter.scenes.interfaces import Move
 
@@ -69,13 +72,25 @@ def move(
         raise InputError(f"--plan-only with --fidelity {fidelity.value}; expected --fidelity arm")
     requested = read_moves(moves) if moves else [Move(str(pick), str(place))]
     file, config = load_scene_and_config(scene, catalog, config_file, cell_file, settings)
-    prepare_output_directory(out)
-    start = settle_scene(file.scene, config, seed)
+    pairs = [[move.pick, move.place] for move in requested]
+    options = {"moves": pairs, "fidelity": fidelity.value, "plan_only": plan_only}
+    job = scene_job("move", scene, config, catalog, seed=seed, **options)
+    with open_job_folder(out, job):
+        result = read_result(out / (PLAN_FILE if plan_only else EPISODE_FILE))
+        if result is None:
+            start = settle_scene(file.scene, config, seed)
+            if plan_only:
+                result = {"plans": plan_moves(start, requested, seed, config, out)}
+            else:
+                task = execute_moves(
+                    start, requested, seed, config, print_transition, fidelity.value
+                )
+                title = f"Moves in {scene.name}"
+                result = write_episode(
+                    out, task, title, "given moves", fidelity.value, seed, config
+                )
     if plan_only:
-        plans = plan_moves(start, requested, seed, config, out)
+        plans = result["plans"]
         print_result({"plans": plans}, describe_plans(plans), as_json, f"{out}")
-        return
-    task = execute_moves(start, requested, seed, config, print_transition, fidelity.value)
-    title = f"Moves in {scene.name}"
-    episode = write_episode(out, task, title, "given moves", fidelity.value, seed, config)
-    print_episode(episode, as_json, out)
+    else:
+        print_episode(result, as_json, out)

@@ -19,14 +19,11 @@ class Fidelity(Enum):
 
 SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE.yaml", help="Scene file.")]
 OutOption = Annotated[
-    Path, typer.Option("--out", metavar="DIR", help="Output folder; must be new or empty.")
-]
-ResumableOutOption = Annotated[
     Path,
     typer.Option(
         "--out",
         metavar="DIR",
-        help="Output folder: new, empty, or of the same job, which is resumed.",
+        help="Output folder: new, empty, or of the same command, which is resumed.",
     ),
 ]
 SeedOption = Annotated[

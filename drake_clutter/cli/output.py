@@ -3,8 +3,8 @@
 import json
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import redirect_stdout, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -100,6 +100,25 @@ def progress_bar(
         num_done: Number of items that an earlier run has finished.
         total: Number of items, including those.
     """
+    with redirect_stdout(sys.stderr), _progress(description) as bar:
+        yield from bar.track(items, total=total, completed=num_done)
+
+
+@contextmanager
+def counter(description: str, most: int) -> Iterator[Callable[[], None]]:
+    """Yield a function whose calls a progress bar on standard error counts.
+
+    Args:
+        description: What is counted, such as "moves evaluated".
+        most: Number of calls at most.
+    """
+    with _progress(description) as bar:
+        task = bar.add_task("", total=most)
+        yield lambda: bar.advance(task)
+
+
+def _progress(description: str) -> Progress:
+    """Return an empty progress bar on standard error."""
     columns = (
         TextColumn(description),
         BarColumn(),
@@ -107,8 +126,7 @@ def progress_bar(
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with redirect_stdout(sys.stderr), Progress(*columns, console=err_console) as bar:
-        yield from bar.track(items, total=total, completed=num_done)
+    return Progress(*columns, console=err_console)
 
 
 def show_recording(

@@ -10,7 +10,6 @@ from drake_clutter.cli.options import (
     SetOption,
 )
 from drake_clutter.cli.output import print_result
-from drake_clutter.files import prepare_output_directory
 
 
 def render(
@@ -26,10 +25,11 @@ def render(
     Writes `color.png`, `depth.png` (16 bit, 0.1 mm per step), `label.png` (k for object k, 0 for
     anything else), `visible.json` (visible fraction of each object) and `picture.png`.
     """
+    from drake_clutter.commands.job_file import open_job_folder, scene_job
     from drake_clutter.commands.render_scene import render_scene
 
     file, config = load_scene_and_config(scene, catalog, config_file, cell_file, settings)
-    prepare_output_directory(out)
-    fractions = render_scene(file.settled_scene, config, out)
+    with open_job_folder(out, scene_job("render", scene, config, catalog)):
+        fractions = render_scene(file.settled_scene, config, out)
     rows = {name: f"{fraction:.3f}" for name, fraction in fractions.items()}
     print_result(fractions, rows, False, "visible fraction")

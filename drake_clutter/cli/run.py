@@ -21,7 +21,6 @@ from drake_clutter.cli.options import (
     SetOption,
 )
 from drake_clutter.cli.output import print_episode, print_transition
-from drake_clutter.files import prepare_output_directory
 
 if TYPE_CHECKING:
     from drake_clutter.systems.scenario import Scenario
@@ -109,7 +108,6 @@ def run(
     from drake_clutter.commands.run_scenario import run_scenario
 
     scenario = _load_scenario(scenario_file, cell_file, settings)
-    prepare_output_directory(out)
     print_episode(run_scenario(scenario, out, print_transition), as_json, out)
 
 
@@ -129,5 +127,4 @@ def demo(
 
     scenario = _load_scenario(None, cell_file, settings)
     scenario = replace(scenario, seed=seed, nodes=nodes, perception="depth")
-    prepare_output_directory(out)
     print_episode(run_demo(scenario, out, print_transition), as_json, out)

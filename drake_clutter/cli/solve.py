@@ -15,8 +15,7 @@ from drake_clutter.cli.options import (
     SeedOption,
     SetOption,
 )
-from drake_clutter.cli.output import print_result, print_transition
-from drake_clutter.files import prepare_output_directory
+from drake_clutter.cli.output import counter, print_result, print_transition
 from drake_clutter.limits import MAX_COUNT
 
 
@@ -42,11 +41,18 @@ def solve(
     Writes `solution.json` and, with a plan, `moves.yaml`, `episode.json` and `index.html`.
     """
     from drake_clutter.commands.explore_scene import settle_scene
-    from drake_clutter.commands.solve_scene import solve_scene
+    from drake_clutter.commands.job_file import open_job_folder, read_result, scene_job
+    from drake_clutter.commands.solve_scene import SOLUTION_FILE, solve_scene
     from drake_clutter.reports.terminal_text import describe_solution
 
     file, config = load_scene_and_config(scene, catalog, config_file, cell_file, settings)
-    prepare_output_directory(out)
-    start = settle_scene(file.scene, config, seed)
-    solution = solve_scene(start, scene.name, out, seed, budget, config, print_transition)
+    job = scene_job("solve", scene, config, catalog, seed=seed, budget=budget)
+    with open_job_folder(out, job):
+        solution = read_result(out / SOLUTION_FILE)
+        if solution is None:
+            start = settle_scene(file.scene, config, seed)
+            with counter("moves evaluated", budget) as on_evaluation:
+                solution = solve_scene(
+                    start, scene.name, out, seed, budget, config, on_evaluation, print_transition
+                )
     print_result(solution, describe_solution(solution), as_json, f"{out}")

@@ -1,6 +1,7 @@
 """Evaluation of exploration policies on stable scenes with hidden objects."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -12,15 +13,18 @@ from drake_clutter.agents.episode_evaluation import (
     EpisodeSpec,
     summarize_episodes,
 )
-from drake_clutter.agents.explorers import make_policy_factory
+from drake_clutter.agents.explorers import PRETRAINED_EXPLORERS, make_policy_factory
 from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import InputError, file_sha256, write_json
+from drake_clutter.files import InputError, file_sha256, read_json, reading_file, write_json
+from drake_clutter.learning.pretrained import checkpoint_sha256
+from drake_clutter.outputs import output_file
+from drake_clutter.records import partial_records, resume_jsonl
 from drake_clutter.resources import git_commit, resource_path
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.scenes.scene_file import load_scene
-from drake_clutter.validation import to_plain
+from drake_clutter.validation import to_plain, validate
 from drake_clutter.workers.parallel_map import map_ordered
 
 PAPER_MOVE_LIMIT = 10
@@ -116,24 +120,11 @@ def common_cell(scenes: Sequence[EvaluationScene]) -> WorkCell:
     return first.cell
 
 
-def evaluate_explorers(
-    scenes: Sequence[EvaluationScene],
-    agents: Sequence[str],
-    max_moves: int,
-    fidelity: str,
-    seed: int,
-    config: ClutterConfig,
-    catalog_folder: Path | None,
-    workers: int,
-    out: Path | None,
-    progress: Callable[[Iterable[Any], int], Iterable[EpisodeResult]],
-    ray_address: str | None = None,
-) -> list[dict[str, Any]]:
-    """Run every policy on every scene and return statistics by policy.
+@dataclass(frozen=True)
+class ExplorerEvaluation:
+    """Evaluation of exploration policies.
 
-    Statistics are over the scenes with objects that are hidden from the camera of `config`.
-
-    Args:
+    Attributes:
         scenes: The scenes.
         agents: Names of the policies; repeated names are ignored.
         max_moves: Maximum number of moves per episode.
@@ -141,9 +132,88 @@ def evaluate_explorers(
         seed: Seed of policies and simulation.
         config: Configuration.
         catalog_folder: Asset folder with the user's object classes, or None.
+    """
+
+    scenes: Sequence[EvaluationScene]
+    agents: Sequence[str]
+    max_moves: int
+    fidelity: str
+    seed: int
+    config: ClutterConfig
+    catalog_folder: Path | None
+
+    @property
+    def episodes(self) -> list[EpisodeSpec]:
+        """The episodes: every policy on every scene."""
+        return [
+            EpisodeSpec(scene.file, scene.index, agent, index)
+            for agent in dict.fromkeys(self.agents)
+            for index, scene in enumerate(self.scenes)
+        ]
+
+    def check_agents(self) -> None:
+        """Raise an InputError if there is no such policy, or it does not know the classes."""
+        classes = frozenset[str]().union(*(scene.classes for scene in self.scenes))
+        for agent in self.agents:
+            make_policy_factory(agent, self.config, classes)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything that determines the results, for JSON."""
+        folder = str(self.catalog_folder.resolve()) if self.catalog_folder else None
+        agents = dict.fromkeys(self.agents)
+        hashes = {str(scene.file): file_sha256(scene.file) for scene in self.scenes}
+        return {
+            "max_moves": self.max_moves,
+            "seed": self.seed,
+            "fidelity": self.fidelity,
+            "config": to_plain(self.config),
+            "catalog_folder": folder,
+            "agents": {name: checkpoint_sha256(name, PRETRAINED_EXPLORERS) for name in agents},
+            "scenes": hashes,
+            "num_scenes": len(self.scenes),
+        }
+
+    def summarize(self, results: Sequence[EpisodeResult]) -> list[dict[str, Any]]:
+        """Return statistics of each policy; see `summarize_episodes`.
+
+        Args:
+            results: Results of all episodes.
+
+        Raises:
+            InputError: No scene has objects that are hidden from the camera of the configuration.
+        """
+        limits = move_limits(self.max_moves)
+        max_objects = max(scene.num_objects for scene in self.scenes)
+        rows = list[dict[str, Any]]()
+        for agent in dict.fromkeys(self.agents):
+            hidden = [result for result in results if result.hidden and result.agent == agent]
+            if not hidden:
+                raise InputError(
+                    f"--scenes: none of {len(self.scenes)} scenes has objects that are hidden from "
+                    "the configured camera; expected scenes with hidden objects"
+                )
+            rows.append({"agent": agent} | summarize_episodes(hidden, limits, max_objects))
+        return rows
+
+
+def evaluate_explorers(
+    evaluation: ExplorerEvaluation,
+    workers: int,
+    out: Path | None,
+    progress: Callable[[Iterable[EpisodeResult], int, int], Iterable[EpisodeResult]],
+    ray_address: str | None = None,
+) -> list[dict[str, Any]]:
+    """Run every policy on every scene and return statistics by policy.
+
+    Statistics are over the scenes with objects that are hidden from the camera of the
+    configuration. With an output file, an interrupted evaluation is resumed, and the rows of a
+    finished one are returned.
+
+    Args:
+        evaluation: What is evaluated.
         workers: Number of worker processes.
         out: JSON file for statistics, episodes, commit and hashes of the scenes; or None.
-        progress: Wraps the results, given the number of episodes.
+        progress: Wraps the new results, given the number of existing results and of all episodes.
         ray_address: Address of the Ray cluster that runs the workers; None runs them locally.
 
     Returns:
@@ -151,53 +221,60 @@ def evaluate_explorers(
 
     Raises:
         InputError: A policy does not exist or was not trained with the classes of the scenes, `out`
-            cannot be written, or no scene hides an object.
+            cannot be written or holds other results, or no scene hides an object.
     """
     if out is not None and (out.is_dir() or not out.parent.is_dir()):
         raise InputError(
             f"--out {out}: is a folder, or its folder does not exist; expected a file in an"
             " existing folder"
         )
-    agents = list(dict.fromkeys(agents))
-    classes = frozenset[str]().union(*(scene.classes for scene in scenes))
-    for agent in agents:
-        make_policy_factory(agent, config, classes)  # raises before any episode is run
-    episodes = [
-        EpisodeSpec(scene.file, scene.index, agent, index)
-        for agent in agents
-        for index, scene in enumerate(scenes)
-    ]
-    make_worker = partial(EpisodeRunner, config, catalog_folder, max_moves, seed, fidelity)
-    results_in_order = map_ordered(make_worker, episodes, workers=workers, ray_address=ray_address)
-    results = [result for result in progress(results_in_order, len(episodes)) if result.hidden]
-    if not results:
-        raise InputError(
-            f"--scenes: none of {len(scenes)} scenes has objects that are hidden from the "
-            "configured camera; expected scenes with hidden objects"
+    evaluation.check_agents()
+    episodes = evaluation.episodes
+    make_worker = partial(
+        EpisodeRunner,
+        evaluation.config,
+        evaluation.catalog_folder,
+        evaluation.max_moves,
+        evaluation.seed,
+        evaluation.fidelity,
+    )
+
+    def run_episodes(num_done: int) -> Iterator[EpisodeResult]:
+        results = map_ordered(
+            make_worker, episodes[num_done:], workers=workers, ray_address=ray_address
         )
-    max_objects = max(scene.num_objects for scene in scenes)
-    rows = [
-        {"agent": agent}
-        | summarize_episodes(
-            [result for result in results if result.agent == agent],
-            move_limits(max_moves),
-            max_objects,
-        )
-        for agent in agents
-    ]
+        yield from progress(results, num_done, len(episodes))
+
     if out is None:
-        return rows
-    scene_paths = sorted({scene.file for scene in scenes})
-    fields = {
-        "max_moves": max_moves,
-        "seed": seed,
-        "fidelity": fidelity,
-        "config": to_plain(config),
-        "rows": rows,
-    }
-    fields |= {
-        "commit": git_commit(),
-        "scenes": {str(file): file_sha256(file) for file in scene_paths},
-    }
-    write_json(out, fields | {"episodes": [asdict(result) for result in results]})
+        return evaluation.summarize(list(run_episodes(0)))
+    header = evaluation.to_dict()
+    with output_file(out), partial_records(out) as path:
+        if out.exists():
+            return _read_rows(out, header)
+        lines = resume_jsonl(
+            path, header, lambda done: map(asdict, run_episodes(done)), EpisodeResult
+        )
+        with closing(lines):
+            _, *records = lines
+        rows = evaluation.summarize([EpisodeResult.from_record(record) for record in records])
+        episodes_with_hidden = [record for record in records if record["hidden"]]
+        fields = {"commit": git_commit(), "rows": rows, "episodes": episodes_with_hidden}
+        write_json(out, header | fields)
     return rows
+
+
+def _read_rows(out: Path, header: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the statistics in the file of a finished evaluation.
+
+    Raises:
+        InputError: The file cannot be read, or is of another evaluation.
+    """
+    expected = "a new file, or one of the same evaluation"
+    with reading_file(f"--out {out}", expected):
+        document = validate(dict[str, Any], read_json(out, expected), str(out))
+        differing = [key for key, value in header.items() if document.get(key) != value]
+        if not differing:
+            return validate(list[dict[str, Any]], document["rows"], f"{out}: rows")
+    raise InputError(
+        f"--out {out}: exists and holds other results ({', '.join(differing)}); give {expected}"
+    )

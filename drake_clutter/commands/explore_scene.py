@@ -31,6 +31,11 @@ from drake_clutter.tasks.exploration_task import ExplorationTask, TerminationRea
 from drake_clutter.validation import NonEmptyText, StrictModel, to_plain, validate
 from drake_clutter.yaml_io import read_yaml
 
+EPISODE_FILE = "episode.json"
+"""File of an episode's document, which is written last."""
+PLAN_FILE = "plan.json"
+"""File of planned moves."""
+
 TransitionCallback = Callable[[Transition], None]
 """Function that is called with each transition of an episode."""
 
@@ -175,7 +180,7 @@ def plan_moves(
         )
         plans.append({"move": {"pick": move.pick, "place": move.place}, **plan_to_dict(plan)})
     write_json(
-        out / "plan.json",
+        out / PLAN_FILE,
         {"seed": seed, "cell": to_plain(config.cell.with_support(scene.support)), "plans": plans},
     )
     return plans
@@ -275,5 +280,5 @@ def write_episode(
             cell,
         )
     fields["cell"] = to_plain(cell)
-    write_json(out / "episode.json", fields)
+    write_json(out / EPISODE_FILE, fields)
     return fields

@@ -361,18 +361,18 @@ def run_feasibility_study(
     """
     for path in job.scenes:
         load_scene(path, load_catalog(job.catalog_folder))
-    open_job_folder(out, job.to_dict())
-    folder = out / PARTS_FOLDER
-    folder.mkdir(exist_ok=True)
     parts = [StudyPart(setup, index) for setup in job.setups for index in range(len(job.scenes))]
     parts += [StudyPart(setup) for setup in job.setups]
     parts += [StudyPart(next(iter(job.setups)), None, x) for x in BASE_GRID_X]
-    remaining = [part for part in parts if not (folder / part.file_name).exists()]
-    new_results = map_ordered(partial(FeasibilityWorker, job), remaining, workers=workers)
-    num_done = len(parts) - len(remaining)
-    for part, result in zip(remaining, progress(new_results, num_done, len(parts)), strict=True):
-        write_json(folder / part.file_name, _nan_to_none(result))
-    return _write_results(job, out, {part: load_part(folder, part) for part in parts})
+    with open_job_folder(out, job.to_dict()):
+        folder = out / PARTS_FOLDER
+        folder.mkdir(exist_ok=True)
+        missing = [part for part in parts if not (folder / part.file_name).exists()]
+        results = map_ordered(partial(FeasibilityWorker, job), missing, workers=workers)
+        shown = progress(results, len(parts) - len(missing), len(parts))
+        for part, result in zip(missing, shown, strict=True):
+            write_json(folder / part.file_name, _nan_to_none(result))
+        return _write_results(job, out, {part: load_part(folder, part) for part in parts})
 
 
 @cache

@@ -22,8 +22,8 @@ from drake_clutter.agents.generators import (
     summarize_scenes,
 )
 from drake_clutter.catalog import load_catalog
-from drake_clutter.commands.job_file import JOB_FILE, open_job_folder
-from drake_clutter.files import InputError, prepare_output_directory, read_json, write_json
+from drake_clutter.commands.job_file import open_job_folder
+from drake_clutter.files import InputError, read_json, write_json
 from drake_clutter.grammar import NodeBudget
 from drake_clutter.reports.contact_sheet import MAX_THUMBNAILS, write_contact_sheet
 from drake_clutter.reports.scene_images import SceneRenderer
@@ -112,9 +112,20 @@ def generate_scenes(
         # These raise if a model is missing or disagrees, before anything is written.
         _ = object_class.verified_sdf_path
         _ = object_class.corners
-    entries = (JOB_FILE, PROGRESS_FILE, SUMMARY_FILE, CONTACT_SHEET_FILE, SCENES_FOLDER)
-    prepare_output_directory(out, allowed_entries=frozenset(entries))
-    open_job_folder(out, job.to_dict())
+    with open_job_folder(out, job.to_dict()):
+        return _generate_missing_scenes(job, count, out, workers, progress, ray_address)
+
+
+def _generate_missing_scenes(
+    job: GenerationJob,
+    count: int,
+    out: Path,
+    workers: int,
+    progress: Callable[[Iterable[GeneratedScene], int, int], Iterable[GeneratedScene]],
+    ray_address: str | None,
+) -> dict[str, Any]:
+    """Generate the scenes that a job's folder lacks; see `generate_scenes`."""
+    catalog = load_catalog(job.catalog_folder)
     folder = out / SCENES_FOLDER
     folder.mkdir(exist_ok=True)
     paths = [folder / f"{index:04d}.yaml" for index in range(count)]

@@ -5,18 +5,36 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from drake_clutter.agents.generators import GenerationJob, SceneGenerator
+from drake_clutter.agents.explorers import PRETRAINED_EXPLORERS
+from drake_clutter.agents.generators import (
+    PRETRAINED_GENERATORS,
+    GenerationJob,
+    SceneGenerator,
+)
 from drake_clutter.catalog import load_catalog
-from drake_clutter.commands.explore_scene import TransitionCallback, settle_scene, write_episode
-from drake_clutter.files import InputError, write_text
+from drake_clutter.commands.explore_scene import (
+    EPISODE_FILE,
+    TransitionCallback,
+    settle_scene,
+    write_episode,
+)
+from drake_clutter.commands.job_file import open_job_folder, read_result
+from drake_clutter.files import InputError, file_sha256, reading_file, write_text
+from drake_clutter.learning.pretrained import checkpoint_sha256
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene, save_scene
 from drake_clutter.systems.closed_loop import ClosedLoop, Timing
-from drake_clutter.systems.scenario import Scenario, class_names, make_perception, make_policy
+from drake_clutter.systems.scenario import (
+    PRETRAINED_DETECTORS,
+    Scenario,
+    class_names,
+    make_perception,
+    make_policy,
+)
 from drake_clutter.tasks.arm_reachability_bound import ArmReachabilityBound
 from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration_task import ExplorationTask, TerminationReason
-from drake_clutter.validation import config_yaml
+from drake_clutter.validation import config_yaml, to_plain
 
 MAX_DEMO_SCENES = 5
 """Maximum number of scenes that the demo explores; the arm may fail in one of them."""
@@ -131,41 +149,69 @@ def write_scenario_results(
     )
 
 
+def _scenario_job(command: str, scenario: Scenario) -> dict[str, Any]:
+    """Return the job document of a command that runs a scenario."""
+    weights = {
+        "generator": checkpoint_sha256(scenario.generator, PRETRAINED_GENERATORS),
+        "agent": checkpoint_sha256(scenario.agent, PRETRAINED_EXPLORERS),
+        "perception": checkpoint_sha256(scenario.perception, PRETRAINED_DETECTORS),
+    }
+    scene_hash = ""
+    if scenario.scene:
+        with reading_file(scenario.scene, "a scene file"):
+            scene_hash = file_sha256(Path(scenario.scene))
+    return {
+        "command": command,
+        "scenario": to_plain(scenario),
+        "scene_sha256": scene_hash,
+        "weights": weights,
+    }
+
+
 def run_scenario(
     scenario: Scenario, out: Path, on_transition: TransitionCallback
 ) -> dict[str, Any]:
-    """Run a scenario and write its results; see `write_scenario_results`."""
-    scene, _ = load_or_generate_scene(scenario)
-    task, timing = run_closed_loop(scenario, scene, on_transition)
-    return write_scenario_results(
-        out,
-        scenario,
-        task,
-        timing,
-        f"{scenario.agent} explores {Path(scenario.scene).name or 'a scene'} with the arm",
-    )
+    """Run a scenario and write its results; see `write_scenario_results`.
+
+    Results that the folder already holds are returned.
+    """
+    with open_job_folder(out, _scenario_job("run", scenario)):
+        if (episode := read_result(out / EPISODE_FILE)) is not None:
+            return dict(episode)
+        scene, _ = load_or_generate_scene(scenario)
+        task, timing = run_closed_loop(scenario, scene, on_transition)
+        return write_scenario_results(
+            out,
+            scenario,
+            task,
+            timing,
+            f"{scenario.agent} explores {Path(scenario.scene).name or 'a scene'} with the arm",
+        )
 
 
 def run_demo(scenario: Scenario, out: Path, on_transition: TransitionCallback) -> dict[str, Any]:
     """Explore generated scenes from depth images until all objects of one are found.
 
-    Writes the results of the last scene; see `write_scenario_results`. Scenes in which the arm
-    cannot reveal every object are skipped.
+    Writes the results of the last scene; see `write_scenario_results`. Results that the folder
+    already holds are returned. Scenes in which the arm cannot reveal every object are skipped.
     """
-    arm_bound = ArmReachabilityBound(scenario.world)
-    index = -1
-    for num_scenes in range(1, MAX_DEMO_SCENES + 1):  # noqa: B007, used after the loop
-        scene, index = load_or_generate_scene(
-            scenario, index + 1, lambda scene: not arm_bound.find_unrevealable(scene)
+    with open_job_folder(out, _scenario_job("demo", scenario)):
+        if (episode := read_result(out / EPISODE_FILE)) is not None:
+            return dict(episode)
+        arm_bound = ArmReachabilityBound(scenario.world)
+        index = -1
+        for num_scenes in range(1, MAX_DEMO_SCENES + 1):  # noqa: B007, used after the loop
+            scene, index = load_or_generate_scene(
+                scenario, index + 1, lambda scene: not arm_bound.find_unrevealable(scene)
+            )
+            task, timing = run_closed_loop(scenario, scene, on_transition)
+            if task.termination is TerminationReason.ALL_FOUND:
+                break
+        return write_scenario_results(
+            out,
+            scenario,
+            task,
+            timing,
+            f"Closed-loop exploration of an SG* scene (seed {scenario.seed}, scene {index})",
+            scenes_tried=num_scenes,
         )
-        task, timing = run_closed_loop(scenario, scene, on_transition)
-        if task.termination is TerminationReason.ALL_FOUND:
-            break
-    return write_scenario_results(
-        out,
-        scenario,
-        task,
-        timing,
-        f"Closed-loop exploration of an SG* scene (seed {scenario.seed}, scene {index})",
-        scenes_tried=num_scenes,
-    )

@@ -1,5 +1,6 @@
 """Shortest plans from full state information, confirmed in Drake."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,9 @@ from drake_clutter.tasks.exploration_task import TerminationReason
 from drake_clutter.tasks.oracle_search import OracleSearch, Solvability
 from drake_clutter.yaml_io import to_yaml
 
+SOLUTION_FILE = "solution.json"
+"""File of the result, which is written last."""
+
 
 def solve_scene(
     scene: Scene,
@@ -19,6 +23,7 @@ def solve_scene(
     seed: int,
     budget: int,
     config: ClutterConfig,
+    on_evaluation: Callable[[], None],
     on_transition: TransitionCallback,
 ) -> dict[str, Any]:
     """Search for the shortest plan that reveals all objects, and execute it.
@@ -32,6 +37,7 @@ def solve_scene(
         seed: Seed of placements among equally good ones, and of Drake's random offsets.
         budget: Maximum number of moves that the search may evaluate.
         config: Configuration.
+        on_evaluation: Called before each move that the search evaluates.
         on_transition: Called after each executed move.
 
     Returns:
@@ -40,7 +46,7 @@ def solve_scene(
     Raises:
         InputError: The scene has too many objects for the search.
     """
-    solution = OracleSearch(config).solve(scene, seed, budget)
+    solution = OracleSearch(config).solve(scene, seed, budget, on_evaluation=on_evaluation)
     fields: dict[str, Any] = {
         "solvability": solution.solvability.value,
         "moves": len(solution.plan) if solution.solvability is Solvability.SOLVABLE else None,
@@ -67,5 +73,5 @@ def solve_scene(
             seed,
             config,
         )
-    write_json(out / "solution.json", fields)
+    write_json(out / SOLUTION_FILE, fields)
     return fields

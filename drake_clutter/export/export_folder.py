@@ -2,7 +2,6 @@
 
 import os
 import re
-import secrets
 import shutil
 from enum import Enum
 from pathlib import Path
@@ -12,7 +11,7 @@ from drake_clutter.export.glb_writer import ROOT_NODE, write_glb
 from drake_clutter.export.mjcf_writer import write_mjcf
 from drake_clutter.export.model_parts import classes_in_scene
 from drake_clutter.export.sdf_writer import write_sdf
-from drake_clutter.files import InputError
+from drake_clutter.files import InputError, temporary_path
 from drake_clutter.scenes.scene import TRAY, Scene
 
 _VALID_NAME = re.compile(r"\w([\w. -]*\w)?")
@@ -46,7 +45,8 @@ def export_scene(scene: Scene, format: ExportFormat, out: Path) -> Path:
     Args:
         scene: The scene: the support, and every object at its X_TO.
         format: The format.
-        out: An existing, empty folder. It stays empty if the export fails.
+        out: An existing folder, empty or of the same export, whose files are replaced. It stays
+            empty if the export fails.
 
     Returns:
         The file to open: `scene.dmd.yaml`, `scene.sdf`, `scene.xml` or `scene.glb` in `out`.
@@ -64,13 +64,16 @@ def export_scene(scene: Scene, format: ExportFormat, out: Path) -> Path:
             )
     for object_class in classes_in_scene(scene):
         _ = object_class.verified_sdf_path  # raises before anything is written
-    staging = out / f".export.{secrets.token_hex(4)}"
+    staging = temporary_path(out / "export")
     staging.mkdir()
     try:
         main_file = _WRITERS[format](scene, staging)
         # The file to open is moved last, so that its presence means a complete export.
         for entry in sorted(staging.iterdir(), key=lambda entry: (entry == main_file, entry.name)):
-            os.replace(entry, out / entry.name)
+            target = out / entry.name
+            if target.is_dir():  # of the same export, which was killed
+                shutil.rmtree(target)
+            os.replace(entry, target)
     except OSError as error:
         error.filename = error.filename or str(out)  # a full disk has none
         raise

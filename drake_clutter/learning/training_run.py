@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -16,7 +17,6 @@ from drake_clutter.files import (
     InputError,
     file_sha256,
     input_error,
-    prepare_output_directory,
     read_json,
     read_text,
     reading_file,
@@ -24,6 +24,7 @@ from drake_clutter.files import (
     write_text,
 )
 from drake_clutter.learning.checkpoint import save_checkpoint
+from drake_clutter.outputs import check_folder_is_empty, output_folder
 from drake_clutter.resources import git_commit
 from drake_clutter.validation import (
     CountOrZero,
@@ -91,7 +92,7 @@ class TrainingRun:
 
         Raises:
             InputError: The folder holds other files, or a run with another configuration or other
-                input files.
+                input files, or another process trains in it.
         """
         self._folder = folder
         self._config = config
@@ -101,24 +102,36 @@ class TrainingRun:
         text = config_yaml(config) + "".join(
             f"# {file}: sha256 {digest}\n" for file, digest in self._input_hashes.items()
         )
-        if not (folder / CONFIG_FILE).exists():
-            prepare_output_directory(folder)
-            write_text(folder / CONFIG_FILE, text)
-        elif _with_current_names(folder / CONFIG_FILE, type(config)) != text:
-            raise InputError(
-                f"--out {folder}: holds a run of another config or other files, see {CONFIG_FILE}; "
-                "give the same ones or another folder"
-            )
         self.history: list[dict[str, Any]] = []
-        if (folder / STATE_FILE).exists():
-            _load_state(learner, folder / STATE_FILE)
-            rows = _read_history(folder / HISTORY_FILE)
-            self.history = [row for row in rows if row["step"] <= learner.step]
+        with ExitStack() as lock:
+            lock.enter_context(output_folder(folder))
+            self._open(text)
+            self._lock = lock.pop_all()
         self._console = Console(stderr=True)
         self._writer = SummaryWriter(str(folder / TENSORBOARD_FOLDER), purge_step=learner.step)
         self._seconds_before = self.history[-1]["seconds"] if self.history else 0.0
         self._start_time = time.monotonic()
         self._start_step = learner.step
+
+    def _open(self, text: str) -> None:
+        """Write the configuration to a new folder, or restore the run that the folder holds.
+
+        Args:
+            text: Content of `CONFIG_FILE`.
+        """
+        folder = self._folder
+        if not (folder / CONFIG_FILE).exists():
+            check_folder_is_empty(folder)
+            write_text(folder / CONFIG_FILE, text)
+        elif _with_current_names(folder / CONFIG_FILE, type(self._config)) != text:
+            raise InputError(
+                f"--out {folder}: holds a run of another config or other files, see {CONFIG_FILE}; "
+                "give the same ones or another folder"
+            )
+        if (folder / STATE_FILE).exists():
+            _load_state(self._learner, folder / STATE_FILE)
+            rows = _read_history(folder / HISTORY_FILE)
+            self.history = [row for row in rows if row["step"] <= self._learner.step]
 
     def report(self, charts: Mapping[str, float], losses: Mapping[str, float]) -> None:
         """Record an evaluation in the history, as curves and on the screen.
@@ -184,7 +197,7 @@ class TrainingRun:
         self._learner.save(self._folder / STATE_FILE)
 
     def finish(self, name: str, network: nn.Module, metadata: Mapping[str, Any]) -> None:
-        """Write the checkpoint and the learner's state.
+        """Write the checkpoint and the learner's state, and let others write to the folder.
 
         Args:
             name: File name of the checkpoint.
@@ -204,6 +217,7 @@ class TrainingRun:
             },
         )
         self.save()
+        self._lock.close()
 
 
 class _HistoryRow(BaseModel):

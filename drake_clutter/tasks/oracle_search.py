@@ -6,7 +6,7 @@ hides objects is solvable.
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -130,6 +130,7 @@ class OracleSearch:
         known: Collection[str] = (),
         rng: np.random.Generator | None = None,
         invalid_moves: Collection[Move] = (),
+        on_evaluation: Callable[[], None] = lambda: None,
     ) -> SearchResult:
         """Search for a plan.
 
@@ -143,6 +144,7 @@ class OracleSearch:
             rng: Random generator that will choose the placements, used instead of the seed. Its
                 state is not changed.
             invalid_moves: Moves that failed in this scene, with which no plan may start.
+            on_evaluation: Called before each move that is evaluated.
 
         Raises:
             InputError: The scene has more than `MAX_OBJECTS` objects.
@@ -153,6 +155,7 @@ class OracleSearch:
                 "for an oracle search"
             )
         self._invalid_first_moves = invalid_moves
+        self._on_evaluation = on_evaluation
         self._remaining_budget = budget
         self._num_inconclusive = 0
         rng_state = (rng or item_rng(seed)).bit_generator.state
@@ -357,6 +360,7 @@ class OracleSearch:
         if self._remaining_budget <= 0:
             raise _OutOfBudgetError
         self._remaining_budget -= 1
+        self._on_evaluation()
         rng = np.random.default_rng()
         rng.bit_generator.state = dict(state.rng_state)
         command = resolve_placement(move, state.observation, self._config, rng)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Generator, Iterable
 from typing import TypeVar
 
-from drake_clutter.workers.process_pool import map_in_processes, map_in_recycled_processes
+from drake_clutter.workers.process_pool import map_in_processes
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -25,9 +25,10 @@ def map_ordered(
     worker is raised here. After an exception, or when the generator is closed, the processes end
     without finishing their current items.
 
-    On a Ray cluster, a worker that dies, alone or with its machine, is replaced, and its item is
-    repeated. A worker takes one CPU; workers for which the cluster has no room wait without
-    blocking the others. All machines need the package, and the workers' files at the same paths.
+    A worker process that dies, on a Ray cluster also with its machine, is replaced, and its item is
+    repeated. On a cluster, a worker takes one CPU; workers for which the cluster has no room wait
+    without blocking the others. All machines need the package, and the workers' files at the same
+    paths.
 
     Args:
         make_worker: Picklable factory of a worker: a class, a module-level function, or a
@@ -41,8 +42,8 @@ def map_ordered(
             Python: an episode of the closed loop keeps 340 MB.
 
     Raises:
-        BrokenProcessPool: A worker process was killed; on a cluster, an item lost its worker three
-            times.
+        BrokenProcessPool: An item lost its worker process `MAX_WORKER_LOSSES` times, or a process
+            could not be started.
         InputError: Ray is not installed, or there is no cluster at the address.
     """
     if workers < 1:
@@ -51,13 +52,9 @@ def map_ordered(
         from drake_clutter.workers.ray_pool import map_on_ray
 
         return map_on_ray(make_worker, items, workers, ray_address)
-    if max_items_per_process is not None:
-        return map_in_recycled_processes(make_worker, items, workers, max_items_per_process)
-    return (
-        _map_in_this_process(make_worker, items)
-        if workers == 1
-        else map_in_processes(make_worker, items, workers)
-    )
+    if workers == 1 and max_items_per_process is None:
+        return _map_in_this_process(make_worker, items)
+    return map_in_processes(make_worker, items, workers, max_items_per_process)
 
 
 def _map_in_this_process(

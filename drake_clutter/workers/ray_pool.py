@@ -2,18 +2,13 @@
 
 import logging
 import os
-from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import Future
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
-from itertools import islice
 from typing import Any, TypeVar
 
 from drake_clutter.files import InputError
+from drake_clutter.workers.job_queue import Job, Loss, map_jobs
 from drake_clutter.workers.process_environment import (
-    IN_FLIGHT_PER_WORKER,
     SINGLE_THREAD_VARIABLES,
     temporary_environment,
 )
@@ -21,8 +16,6 @@ from drake_clutter.workers.process_environment import (
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-MAX_WORKER_LOSSES = 3
-"""Number of worker processes that an item may lose before it fails."""
 SHORT_CONNECTION_TIMEOUTS = {
     "RAY_NUM_REDIS_GET_RETRIES": "1",
     "RAY_gcs_rpc_server_connect_timeout_s": "2",
@@ -60,21 +53,6 @@ class _Actor:
         return result
 
 
-@dataclass
-class _Job:
-    """A pickled item and its processing.
-
-    Attributes:
-        item: Pickled item.
-        result: Result of the item.
-        losses: Number of actors that died with the item.
-    """
-
-    item: bytes
-    result: Future[Any] = field(default_factory=Future)
-    losses: int = 0
-
-
 def map_on_ray(
     make_worker: Callable[[], Callable[[Item], Result]],
     items: Iterable[Item],
@@ -93,7 +71,7 @@ def map_on_ray(
         factory = ray.cloudpickle.dumps(make_worker)
         actors = [actor_class.remote(factory, os.getcwd()) for _ in range(workers)]
         try:
-            yield from _map_over_actors(ray, actors, items)
+            yield from map_jobs(_ActorGroup(ray, actors), items, workers)
         finally:
             for actor in actors:
                 ray.kill(actor)
@@ -126,62 +104,63 @@ def _ray_session(address: str) -> Iterator[Any]:
         ray.shutdown()
 
 
-def _map_over_actors(
-    ray: Any, actors: list[Any], items: Iterable[Any]
-) -> Generator[Any, None, None]:
-    """Distribute the items among the actors, which Ray restarts when they die.
+class _ActorGroup:
+    """Actors of a Ray cluster, which Ray restarts when they die; a `WorkerGroup`.
 
     Ray's own retries are not used. They bind an item to its actor, which never continues if its
     machine is gone and the others have no room, and they are used up while an actor restarts. Here
     an item that was lost with its actor goes to the next actor that is ready.
     """
-    remaining = iter(items)
-    pending: deque[_Job] = deque()  # Jobs whose results are not yielded yet.
-    unassigned: deque[_Job] = deque()  # Pending jobs that no actor is working on.
-    idle: list[Any] = []
-    busy: dict[Any, tuple[Any, _Job | None]] = {
-        actor.ready.remote(): (actor, None) for actor in actors
-    }
-    while True:
-        for item in islice(remaining, len(actors) * IN_FLIGHT_PER_WORKER - len(pending)):
-            pending.append(_Job(ray.cloudpickle.dumps(item)))
-            unassigned.append(pending[-1])
-        if not pending:
-            return
-        if pending[0].result.done():
-            yield pending.popleft().result.result()
-            continue
-        while idle and unassigned:
-            actor = idle.pop()
-            next_job = unassigned.popleft()
-            busy[actor.work.options(max_task_retries=0).remote(next_job.item)] = (actor, next_job)
-        (done,), _ = ray.wait(list(busy))
-        actor, job = busy.pop(done)
+
+    def __init__(self, ray: Any, actors: list[Any]) -> None:
+        """Wait for actors to become ready.
+
+        Args:
+            ray: The module.
+            actors: The actors.
+        """
+        self._ray = ray
+        self._idle = list[Any]()
+        self._busy: dict[Any, tuple[Any, Job | None]] = {}
+        self._await_readiness(actors)
+
+    def _await_readiness(self, actors: Iterable[Any]) -> None:
+        """Let actors get no item before they have responded."""
+        self._busy |= {actor.ready.remote(): (actor, None) for actor in actors}
+
+    def pickle(self, item: Any) -> bytes:
+        """Return a pickled item; see `WorkerGroup`."""
+        pickled: bytes = self._ray.cloudpickle.dumps(item)
+        return pickled
+
+    def assign(self, job: Job) -> bool:
+        """Let an idle actor do a job; see `WorkerGroup`."""
+        if not self._idle:
+            return False
+        actor = self._idle.pop()
+        self._busy[actor.work.options(max_task_retries=0).remote(job.item)] = (actor, job)
+        return True
+
+    def wait(self) -> Loss | None:
+        """Receive the result of an actor, or notice its death; see `WorkerGroup`."""
+        (done,), _ = self._ray.wait(list(self._busy))
+        actor, job = self._busy.pop(done)
         try:
-            result = ray.get(done)
-        except ray.exceptions.RayTaskError as error:  # The worker raised an exception.
+            result = self._ray.get(done)
+        except self._ray.exceptions.RayTaskError as error:  # The worker raised an exception.
             if job is None:
                 raise
             error.cause.__cause__ = error  # It contains the worker's traceback.
             job.result.set_exception(error.cause)
-            idle.append(actor)
-        except ray.exceptions.RayError as error:
+        except self._ray.exceptions.RayError as error:
             if job is None:
                 raise
-            job.losses += 1
-            if job.losses < MAX_WORKER_LOSSES:
-                unassigned.appendleft(job)
-            else:
-                message = (
-                    f"an item ended {MAX_WORKER_LOSSES} worker processes; "
-                    f"the last error was: {error}"
-                )
-                job.result.set_exception(BrokenProcessPool(message))
-            # Other actors may have died, too, for example with their machine. They get no item
-            # before they have responded.
-            busy |= {other.ready.remote(): (other, None) for other in (actor, *idle)}
-            idle.clear()
+            # Other actors may have died, too, for example with their machine.
+            self._await_readiness([actor, *self._idle])
+            self._idle.clear()
+            return Loss(job, f"with the error: {error}")
         else:
             if job is not None:
-                job.result.set_result(ray.cloudpickle.loads(result))
-            idle.append(actor)
+                job.result.set_result(self._ray.cloudpickle.loads(result))
+        self._idle.append(actor)
+        return None
