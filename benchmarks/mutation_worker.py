@@ -26,7 +26,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import suppress
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, SourceFileLoader
@@ -111,26 +111,34 @@ class _MutatedLoader(SourceFileLoader):
         return self.code
 
 
-def replace_code(job: Job) -> bool:
+def existing_functions() -> list[FunctionType]:
+    """Return all functions that the garbage collector knows."""
+    return [thing for thing in gc.get_objects() if isinstance(thing, FunctionType)]
+
+
+def replace_code(job: Job, functions: Iterable[FunctionType]) -> bool:
     """Replace the code of the mutated function wherever the function is referenced.
+
+    Args:
+        job: The job.
+        functions: All functions.
 
     Returns:
         False if the function is not found, or the new code needs other enclosed variables.
     """
     path = str(ROOT / job["path"])
     code = _outermost(compile(job["source"], path, "exec"), job["function"])
-    functions = [
-        thing
-        for thing in gc.get_objects()
-        if isinstance(thing, FunctionType)
-        and thing.__code__.co_filename == path
-        and thing.__code__.co_qualname == code.co_qualname
+    found = [
+        function
+        for function in functions
+        if function.__code__.co_filename == path
+        and function.__code__.co_qualname == code.co_qualname
     ]
-    if any(function.__code__.co_freevars != code.co_freevars for function in functions):
+    if any(function.__code__.co_freevars != code.co_freevars for function in found):
         return False
-    for function in functions:
+    for function in found:
         function.__code__ = code
-    return bool(functions)
+    return bool(found)
 
 
 def _outermost(code: CodeType, qualified_name: str) -> CodeType:
@@ -259,12 +267,15 @@ class Collection:
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         """Read jobs until there are no more."""
         self._session = session
+        self._functions = existing_functions()
+        gc.collect()
+        gc.freeze()  # Many tests collect garbage, which takes long with all tests in memory.
         self._serve(self._run)
         return True
 
     def _run(self, job: Job) -> Result:
         """Replace the code of the mutated function, and run tests."""
-        if "source" in job and not replace_code(job):
+        if "source" in job and not replace_code(job, self._functions):
             return {"failure": NOT_REPLACED}
         config = self._session.config
         run = TestRun(job)
@@ -327,7 +338,6 @@ def main() -> None:
         importlib.import_module(package)
 
     def serve(run: Callable[[Job], Result]) -> None:
-        gc.collect()
         for line in sys.stdin:
             job = json.loads(line)
             result = run_job(job, run)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from benchmarks.mutation_operators import find_mutants, rank
 from benchmarks.mutation_testing import TestCoverage, mutant_row
-from benchmarks.mutation_worker import MutatedModule, replace_code
+from benchmarks.mutation_worker import MutatedModule, existing_functions, replace_code
 
 SOURCE = '''"""Module."""
 LIMITS: dict[str, float] = {"ä": 0.5}
@@ -132,7 +132,7 @@ def test_the_code_of_a_function_is_replaced_wherever_it_is_referenced() -> None:
     original = double.__code__
     job = {"path": str(path), "function": "double"}
     try:
-        assert replace_code(job | {"source": mutant.apply(source)})
+        assert replace_code(job | {"source": mutant.apply(source)}, existing_functions())
         assert references[0](6) == 3
     finally:
         double.__code__ = original

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from conftest import CLASSES, random_scene, resting, rng, scene_of
+from conftest import CLASSES, DEFAULT_CELL, random_scene, resting, rng, scene_of
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -15,8 +15,10 @@ from drake_clutter.scenes.geometry import penetration_depth
 from drake_clutter.scenes.interfaces import Move, Observation
 from drake_clutter.scenes.placement import (
     CELL_SIZE,
+    _first_free_cells,
     find_free_placements,
     has_clear_top,
+    is_observed_free,
     resolve_placement,
     top_height,
 )
@@ -294,3 +296,25 @@ def test_an_object_alone_has_a_clear_top_and_its_height(
     for o in objects:
         assert has_clear_top(observation, observation[o.name])
         assert top_height(observation[o.name]) == pytest.approx(o.top_height)
+
+
+def pixels_at_the_border() -> tuple[NDArray[np.int64], list[bool]]:
+    """Return pixels (column, row) at the corners of the image, and whether they are in it."""
+    width, height = DEFAULT_CELL.camera.width, DEFAULT_CELL.camera.height
+    pixels = [(0, 0), (width - 1, height - 1), (-1, 0), (0, -1)]
+    pixels += [(width, height - 1), (width - 1, height)]
+    return np.array(pixels), [True, True, False, False, False, False]
+
+
+def test_only_points_in_the_image_are_seen_to_be_free() -> None:
+    camera = DEFAULT_CELL.camera
+    depth = np.full((camera.height, camera.width), np.inf, np.float32)
+    pixels, expected = pixels_at_the_border()
+    p_T = camera.backproject(pixels, np.full(len(pixels), 0.5))
+    observation = Observation(depth, (), camera, DEFAULT_CELL.support)
+    assert is_observed_free(observation, p_T).tolist() == expected
+    cell = np.zeros((1, 2), np.int64)
+    for (x, y, z), is_in_image in zip(p_T.tolist(), expected, strict=True):
+        grid = (np.array([x]), np.array([y]), np.array([z]))
+        found = _first_free_cells(depth, camera.pinhole, *grid, cell, cell, np.zeros(1))
+        assert found.tolist() == [0] * is_in_image

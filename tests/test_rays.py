@@ -184,6 +184,18 @@ def test_a_box_from_straight_above_covers_its_top(
     assert depth == pytest.approx(np.full(pixels, CAMERA.X_TC.translation()[2] - height), abs=1e-6)
 
 
+def test_faces_whose_plane_contains_the_camera_are_not_seen() -> None:
+    """A box with a side exactly below the camera shows its top alone."""
+    x, y, z = CAMERA.X_TC.translation()
+    scale = CAMERA.focal_length / (z - 0.060)
+    for direction in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        xy = np.array([x, y]) + np.array(direction) * (0.115, 0.080)
+        box = resting("cracker_box", xy=xy.tolist())
+        pixels = int((labels(scene_of(box)) == 0).sum())
+        assert pixels == pytest.approx(0.230 * 0.160 * scale**2, abs=(0.230 + 0.160) * scale)
+        assert RAYS.visible_fractions(scene_of(box).objects) == {"cracker_box": 1.0}
+
+
 def test_a_box_in_a_corner_shows_its_sides() -> None:
     """Return the area of the hull of a box's corners in the image (shoelace formula)."""
     box = resting("cracker_box", Orientation.UPRIGHT_0, (0.2, 0.15), name="box")
