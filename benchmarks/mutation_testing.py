@@ -1,7 +1,7 @@
 """Measure how many small faults of the modules that decide results the tests catch.
 
-    python -m benchmarks.mutation_testing cover --out FOLDER
-    python -m benchmarks.mutation_testing run --coverage FOLDER --out mutation_testing.json
+    python benchmarks/mutation_testing.py cover --out FOLDER
+    python benchmarks/mutation_testing.py run --coverage FOLDER --out mutation_testing.json
 
 `cover` records which lines each test executes; it needs the package `coverage`. `run` samples
 mutants (`mutation_operators.py`) and runs, for each, the tests that execute the changed line, the

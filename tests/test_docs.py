@@ -103,6 +103,7 @@ PARSED = {
     "evaluate_generators",
     "exported_stability",
     "judge_agreement",
+    "mutation_testing",
     "random_generator_calibration",
 }
 """Scripts without a case of a few seconds: only their options are looked up."""

@@ -20,6 +20,7 @@ import results_generation
 import results_index
 import results_intervals
 import results_judge_agreement
+import results_mutation
 import results_negative
 import results_perception
 from markdown_text import estimate, number, table
@@ -38,6 +39,7 @@ RESULTS = {
         results_index,
         results_intervals,
         results_judge_agreement,
+        results_mutation,
         results_negative,
         results_perception,
     )

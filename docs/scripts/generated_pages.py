@@ -22,6 +22,7 @@ import results_generation
 import results_index
 import results_intervals
 import results_judge_agreement
+import results_mutation
 import results_negative
 import results_perception
 
@@ -40,6 +41,7 @@ PAGES: Mapping[str, Callable[[], str]] = {
     "results/calibration.md": results_calibration.page,
     "results/intervals.md": results_intervals.page,
     "results/export.md": results_export.page,
+    "results/mutation_testing.md": results_mutation.page,
     "results/negative_results.md": results_negative.page,
     **{
         f"reference/api/{name}.md": partial(api_page.package_page, name)

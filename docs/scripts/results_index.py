@@ -17,6 +17,7 @@ PAGES = (
     ("calibration.md", "Calibration", "Random scenes compared with the paper's"),
     ("intervals.md", "Confidence intervals", "Methods, and their coverage for few values"),
     ("export.md", "Exported scenes", "Stable scenes in MuJoCo and PyBullet"),
+    ("mutation_testing.md", "Mutation testing", "Small faults of the code that the tests catch"),
     ("negative_results.md", "Negative results", "What did not help"),
 )
 """File, title and content of the other pages of results."""
