@@ -67,11 +67,17 @@ class PolicyTestBench:
         self.time = 0.0
         self.set_inputs(BEFORE, PlanResponse(), 0)
 
-    def set_inputs(self, observation: Observation, response: PlanResponse, finished: int) -> None:
+    def set_inputs(
+        self,
+        observation: Observation,
+        response: PlanResponse,
+        finished: int,
+        lowered_distance: float = 0.0,
+    ) -> None:
         context = self.simulator.get_mutable_context()
         self.system.GetInputPort("observation").FixValue(context, observation)
         self.system.GetInputPort("response").FixValue(context, response)
-        self.system.GetInputPort("finished").FixValue(context, [finished, 0.0])
+        self.system.GetInputPort("finished").FixValue(context, [finished, lowered_distance])
 
     def advance(self, seconds: float) -> PolicyState:
         self.time += seconds
@@ -101,13 +107,17 @@ def test_the_policy_waits_for_the_move_before_it_observes_again() -> None:
     assert [o.name for o in state.belief.objects] == ["cracker_box"]
     bench.set_inputs(AFTER, PlanResponse(1, make_plan()), 0)
     assert bench.advance(5.0).phase is PolicyPhase.WAITING, "the plan is not finished"
-    bench.set_inputs(AFTER, PlanResponse(1, make_plan()), 1)
+    plan = make_plan()
+    bench.set_inputs(AFTER, PlanResponse(1, plan), 1, lowered_distance=0.004)
     state = bench.advance(0.1)
     assert state.phase is PolicyPhase.OBSERVING
     assert state.belief.history == (Move("cracker_box"),)
     assert [o.name for o in state.belief.objects] == ["cracker_box"], (
         "there is no new observation yet"
     )
+    (believed,) = state.belief.objects
+    assert believed.X_TO.p == pytest.approx(plan.X_TO_place.p - [0.0, 0.0, 0.004])
+    assert believed.X_TO.quaternion == plan.X_TO_place.quaternion
     state = bench.advance(0.6)
     assert state.request.number == 2
     assert {o.name: o.X_TO for o in state.belief.objects} == ASIDE.poses

@@ -63,6 +63,7 @@ class Scripted:
         generator: np.random.Generator,
     ) -> Outcome:
         result = next(self._results)
+        self.command = command
         if not result.was_executed:
             return Outcome(result, scene)
         pick = command.move.pick
@@ -291,6 +292,20 @@ def test_an_object_detected_at_its_old_pose_was_not_placed(detector: LabelDetect
     unseen = replace(before, detections=())
     assert placed.update(unseen).invalid_moves == ()
     assert {o.name: o.X_TO for o in placed.update(unseen).objects}["cover 1"] == place
+
+
+@pytest.mark.parametrize("result", [MoveResult.PLACED, MoveResult.DROPPED])
+def test_a_placed_object_is_believed_where_it_was_put(
+    result: MoveResult, detector: LabelDetector
+) -> None:
+    """Until the next observation. What was dropped is believed where it was."""
+    executor = Scripted(result)
+    backend = SteppedBackend(executor, detector, REWARDS, HIDING, rng())
+    backend.step(Move("cover 1"))
+    (believed,) = (o.X_TO for o in backend.belief.objects if o.name == "cover 1")
+    put = executor.command.X_TO_place
+    assert put.p[2] != HIDING["cover 1"].X_TO.p[2]
+    assert believed == (put if result is MoveResult.PLACED else HIDING["cover 1"].X_TO)
 
 
 def test_invalid_moves_of_a_lost_object_are_removed(detector: LabelDetector) -> None:

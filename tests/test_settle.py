@@ -14,7 +14,7 @@ from drake_clutter.grammar import Orientation
 from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Verdict
 from drake_clutter.scenes.scene import Pose, SceneObject, perturb_poses, tilt_between
 from drake_clutter.simulation.drake_judge import DrakeJudge
-from drake_clutter.simulation.settle import SettleResult, find_instability, settle
+from drake_clutter.simulation.settle import SettleResult, _may_roll_slowly, find_instability, settle
 
 UPRIGHT = Orientation.UPRIGHT_0
 # Cracker boxes are 230 mm long (x) and 60 mm high; a sugar box is 175 mm long, so half of it
@@ -150,6 +150,26 @@ def test_an_object_beside_or_below_the_tray_has_left_it(p_TO: tuple[float, float
     found = find_instability(before, inside, tray(0.70), SettleConfig())
     assert found is not None
     assert found.reason is InstabilityReason.SLID
+
+
+@pytest.mark.parametrize(
+    ("objects", "expected"),
+    [
+        ([resting("large_marker")], False),
+        ([resting("large_marker"), resting("gelatin_box", floor=0.018)], True),
+        ([resting("gelatin_box", floor=0.018), resting("large_marker")], True),
+        ([resting("large_marker"), resting("gelatin_box", xy=(0.0, 0.048))], False),
+        ([resting("large_marker"), resting("gelatin_box", xy=(0.0, 0.044), floor=0.018)], True),
+        ([resting("large_marker", floor=0.028), resting("gelatin_box")], False),
+        ([resting("large_marker"), resting("large_marker", xy=(0.1, 0.0), name="level")], False),
+        ([resting("tomato_soup_can", UPRIGHT), resting("gelatin_box", floor=0.101)], False),
+        ([resting("cracker_box"), resting("gelatin_box", floor=0.06)], False),
+    ],
+)
+def test_a_lying_cylinder_rolls_slowly_only_if_it_carries_something(
+    objects: list[SceneObject], expected: bool
+) -> None:
+    assert _may_roll_slowly(objects) == expected
 
 
 def test_the_same_rng_gives_the_same_poses_bit_for_bit(

@@ -1,12 +1,15 @@
 """The static judge against closed-form statics and Drake; inconclusive scenes."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import resting, rng, scene_of, world_with
+import trimesh
+from conftest import CLASSES, resting, rng, scene_of, world_with
 from scipy.spatial.transform import Rotation
 from test_settle import BELOW, FALLING, MARKER_PAIR, STABLE, STANDING_PAIR
+from test_suction import own_class, revolved
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
@@ -465,3 +468,39 @@ def test_conclusive_scenes_are_not_judged_in_drake(
     config: ClutterConfig, static_judge: StaticStabilityJudge
 ) -> None:
     assert HybridJudge(config).judge(HIDING, rng(2)) == static_judge.judge(HIDING, rng(2))
+
+
+def test_an_object_tips_on_its_narrow_foot_under_an_eccentric_load(tmp_path: Path) -> None:
+    """A cone with its foot of radius 15 mm below carries a box beyond its foot.
+
+    The common center of mass leaves the foot at an offset of the box of 15 mm (1 + m / M), where m
+    is the mass of the cone and M that of the box.
+    """
+    cone = own_class(tmp_path, revolved([(0, 0), (0.015, 0), (0.060, 0.05), (0, 0.05)]))
+    lower = SceneObject("cone", cone, Pose((0.0, 0.0, float(-cone.corners[:, 2].min()))))
+    ratio = cone.mass / CLASSES["gelatin_box"].mass
+    for x, y in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)):
+        for factor in (0.95, 1.05):
+            offset = factor * (0.015 - MARGIN) * (1 + ratio)
+            upper = resting("gelatin_box", xy=(x * offset, y * offset), floor=0.05)
+            assert stands(upper, lower) == (factor < 1)
+
+
+@pytest.mark.parametrize("edge", [0.030, 0.045])
+def test_an_object_alone_topples_if_its_center_of_mass_is_beyond_its_foot(
+    edge: float, tmp_path: Path
+) -> None:
+    """Its section is a trapezoid, whose center of mass is 36 or 42 mm from the straight side."""
+    section = np.array([(0.0, 0.0), (edge, 0.0), (0.100, 0.05), (0.0, 0.05)])
+    hull = np.array([(x, y, z) for x, z in section for y in (-0.03, 0.03)])
+    own = own_class(tmp_path, trimesh.convex.convex_hull(hull))
+    low, high = own.corners.min(axis=0), own.corners.max(axis=0)
+    center = own.center_of_mass[0] - low[0]
+    widths = np.array([edge, 0.100])
+    assert center == pytest.approx(
+        (widths[0] ** 2 + widths.prod() + widths[1] ** 2) / (3 * widths.sum()), rel=1e-3
+    )
+    assert (center < edge) == (edge > 0.04)
+    alone = SceneObject("own", own, Pose((0.1, 0.2, float(-low[2]))))
+    assert high[0] - low[0] == pytest.approx(0.1)
+    assert stands(alone) == (center < edge)
