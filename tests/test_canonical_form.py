@@ -112,3 +112,27 @@ def test_orientations_are_ten() -> None:
     assert [
         np.degrees(o.yaw) for o in Orientation if o.rest is RestOrientation.FLAT
     ] == pytest.approx([0, 30, 60, 90, 120, 150])
+
+
+def test_objects_are_counted_by_stack() -> None:
+    two = "insert_gelatin_box"
+    stack = ("drop_object", "stack_object", "end", two, two, "orient_flat_0", "orient_flat_0")
+    pair = ("drop_object", "end", "insert_meta_sugar_box_1")
+    for rules, stacks, fraction in (
+        ((), [], 0.0),
+        (single("sugar_box", "flat_0"), [["sugar_box"]], 1.0),
+        (
+            (*single("sugar_box", "flat_0"), *stack),
+            [["gelatin_box", "gelatin_box"], ["sugar_box"]],
+            2 / 3,
+        ),
+        (
+            (*pair, *stack, *single("sugar_box", "flat_0")),
+            [["gelatin_box", "gelatin_box"], ["sugar_box"], ["sugar_box", "sugar_box"]],
+            2 / 5,
+        ),
+    ):
+        graph = YCB.replay(rules)
+        kinds = [[graph.kind(node) for node in nodes] for nodes in graph.stack_objects()]
+        assert sorted(kinds) == stacks
+        assert graph.largest_stack_fraction() == fraction

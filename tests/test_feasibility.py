@@ -73,6 +73,9 @@ def test_every_legal_move_has_a_row() -> None:
     assert set(by_pick["large_marker"]) <= {"no seal", "no free spot"}
     assert set(by_pick["pudding_box"]) <= {"carries others", "no free spot"}
     for row in rows:
+        picked = SCENE[row.pick]
+        assert (row.pick_x, row.pick_y) == pytest.approx(picked.X_TO.p[:2], abs=1e-6)
+        assert row.pick_top == pytest.approx(picked.corners_T[:, 2].max(), abs=1e-6)
         assert math.isfinite(row.motion_s) == (row.result == PLANNED)
         assert math.isfinite(row.place_x) == (row.result != "no free spot")
         assert row.num_below == (1 if row.pick == "gelatin_box" else 0)

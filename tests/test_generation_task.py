@@ -60,6 +60,27 @@ def test_the_environment_passes_gymnasium_s_checks() -> None:
     check_env(environment.unwrapped, skip_render_check=True)
 
 
+def test_the_bounds_of_observations() -> None:
+    environment = ClutterGeneration(task=GenerationTaskConfig(nodes=9))
+    spaces = environment.observation_space.spaces
+    vocabulary = environment.vocabulary
+    bounds = {
+        name: (float(space.low.min()), float(space.high.max()))
+        for name, space in spaces.items()
+        if isinstance(space, gymnasium.spaces.Box)
+    }
+    assert bounds == {
+        "node_kind": (0, len(vocabulary.node_kinds)),
+        "node_mask": (0, 1),
+        "node_flags": (0, 1),
+        "position": (pytest.approx(-0.7), pytest.approx(0.7)),  # the size of the tray
+        "edge_links": (0, 8),
+        "edge_kind": (0, len(vocabulary.edge_kinds)),
+        "edge_mask": (0, 1),
+        "remaining_nodes": (0, np.inf),
+    }
+
+
 @pytest.mark.parametrize("objects", ["ycb7", "pantry14"])
 def test_the_observation_represents_the_graph(objects: str) -> None:
     """It includes the finished stacks and the positions of their objects."""

@@ -17,7 +17,7 @@ from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.tasks.belief import Decision, legal_moves
 from drake_clutter.tasks.episode import make_teleport_backend_factory, run_episode
 from drake_clutter.tasks.exploration_task import TerminationReason
-from drake_clutter.tasks.oracle_search import OracleSearch, SearchResult, Solvability
+from drake_clutter.tasks.oracle_search import OracleSearch, SearchResult, Solvability, _State
 
 CONFIG = ClutterConfig()
 JUDGE = StaticStabilityJudge(CONFIG)
@@ -233,6 +233,19 @@ def test_inconclusive_verdicts_do_not_raise_the_lower_bound() -> None:
     if (solution.solvability, solution.moves_evaluated) != (Solvability.UNDECIDED, 0):
         pytest.fail("the static judge could tell", pytrace=False)
     assert solution.lower_bound <= 1
+
+
+def test_states_are_equal_within_a_millimeter() -> None:
+    scene = scene_of(*covered())
+    observation = JUDGE.ray_caster.observe(scene)[0]
+
+    def key(x: float, *known: str) -> object:
+        moved = scene.with_poses({"cover": scene["cover"].X_TO.translated((x, 0.0, 0.0))})
+        return _State(moved, observation, frozenset(known), {}, 0, frozenset()).key
+
+    assert key(0.0004) == key(-0.0004) == key(0.0)
+    assert key(0.0006) != key(0.0)
+    assert key(0.0, "cover") != key(0.0)
 
 
 # --- What the search does not take, or is not to try ---

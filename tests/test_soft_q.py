@@ -278,6 +278,25 @@ def test_invalid_settings_are_rejected(setting: str, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+def test_the_smallest_replay_buffer_holds_a_sequence_of_each_environment() -> (
+    None
+):
+    """Four environments with sequences of eight steps need 36."""
+    assert SMALL.sequence_length == 8
+    SoftQLearner(small_environment, replace(SMALL, buffer_size=36), 0, CPU)
+    with pytest.raises(InputError, match="35; expected 36"):
+        SoftQLearner(small_environment, replace(SMALL, buffer_size=35), 0, CPU)
+
+
+def test_the_learning_rate_is_halved_at_intervals() -> None:
+    config = replace(SMALL, learning_rate=0.08, lr_halving_steps=100)
+    learner = SoftQLearner(small_environment, config, 0, CPU)
+    rates = []
+    for learner.step in (0, 99, 100, 199, 200, 350):
+        rates.append(learner.learning_rate)
+    assert rates == [0.08, 0.08, 0.04, 0.04, 0.02, 0.01]
+
+
 def test_a_warm_start_of_another_width_is_rejected() -> None:
     narrow, wide = (
         SoftQLearner(small_environment, replace(SMALL, width=width), 0, CPU) for width in (8, 12)
