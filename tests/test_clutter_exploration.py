@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from conftest import CATALOG, DEFAULT_CELL, cell_with, random_scene, training_script
+from conftest import CATALOG, DEFAULT_CELL, cell_with, random_scene, rng, training_script
 from gymnasium.utils.env_checker import check_env
 
 from drake_clutter.agents.backend_factory import FIDELITIES, make_backend_factory
@@ -238,6 +238,63 @@ def test_ppo_increases_the_probability_of_rewarded_moves(scenes: SceneDataset) -
     before = lead()
     learner.update(played, rng)
     assert lead() > before + 0.05
+
+
+def entropy(log_probs: torch.Tensor) -> torch.Tensor:
+    """Return the entropy of each distribution. Shape of the log-probabilities: (B, N)."""
+    return torch.distributions.Categorical(logits=log_probs).entropy()
+
+
+def test_the_losses_of_ppo_are_means_over_all_moves(scenes: SceneDataset) -> None:
+    """With a learning rate of 0, every epoch has the same losses; the normalized advantages,
+    and with them the policy loss, are 0 on average."""
+    environment = ClutterExploration(scenes, privileged=True, max_moves=4)
+    config = PPOConfig(width=8, learning_rate=0.0, update_epochs=3, gamma=0.9, gae_lambda=0.8)
+    learner = PPOLearner(environment, config, 0, torch.device("cpu"))
+    played = collect_rollouts(environment, 3, (0,), make_policy_fn(learner.network, rng()))
+    learner.update(played, rng())
+    observations = [observation for episode in played for observation in episode.observations]
+    actions = torch.from_numpy(np.array([a for episode in played for a in episode.actions]))
+    returns = np.concatenate(
+        [
+            compute_gae(episode, 0.9, 0.8) + [value for _, value in episode.policy_extras]
+            for episode in played
+        ]
+    )
+    with torch.no_grad():
+        output = learner.network(collate_graphs(observations))
+        place_log_probs = learner.network.place_log_probs(output, actions[:, 0])
+        error = np.abs(output.value.numpy() - returns)
+        spread = entropy(output.pick_log_probs) + entropy(place_log_probs)
+    assert learner.losses == {
+        "policy": pytest.approx(0.0, abs=1e-5),
+        "value": pytest.approx(np.where(error < 1, error**2 / 2, error - 0.5).mean(), rel=1e-5),
+        "entropy": pytest.approx(float(spread.mean()), rel=1e-5),
+    }
+
+
+def test_the_loss_of_cloning_is_the_mean_of_the_batches(scenes: SceneDataset) -> None:
+    """With a learning rate of 0, the student stays the same."""
+    environment = ClutterExploration(scenes, max_moves=3)
+    torch.manual_seed(1)
+    teacher = ExplorerNetwork(len(environment.node_kind_ids), 8)
+    config = BehaviorCloningConfig(
+        episodes_per_iteration=2, updates_per_iteration=3, batch_size=5, learning_rate=0.0, width=8
+    )
+    learner = BehaviorCloningLearner(environment, teacher, config, 0, torch.device("cpu"))
+    played = learner.train_iteration()
+    learner._update(rng(7))
+    generator = rng(7)
+    states = [
+        replace(episode, observations=[observation], actions=[note])
+        for episode in played
+        for observation, note in zip(episode.observations, episode.policy_extras, strict=True)
+    ]
+    batches = [generator.integers(len(states), size=5) for _ in range(3)]
+    losses = [
+        -mean_log_prob(learner.network, [states[k] for k in batch.tolist()]) for batch in batches
+    ]
+    assert learner.losses == {"cloning": pytest.approx(np.mean(losses), rel=1e-5)}
 
 
 @pytest.mark.parametrize("dagger", [False, True])

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import time
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
@@ -278,9 +279,7 @@ def test_invalid_settings_are_rejected(setting: str, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_the_smallest_replay_buffer_holds_a_sequence_of_each_environment() -> (
-    None
-):
+def test_the_smallest_replay_buffer_holds_a_sequence_of_each_environment() -> None:
     """Four environments with sequences of eight steps need 36."""
     assert SMALL.sequence_length == 8
     SoftQLearner(small_environment, replace(SMALL, buffer_size=36), 0, CPU)
@@ -344,3 +343,32 @@ def test_a_training_with_additional_classes_and_a_warm_start(tmp_path: Path) -> 
 def test_a_missing_checkpoint_is_reported(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.safetensors"):
         load_checkpoint(tmp_path / "none.safetensors")
+
+
+def test_updates_are_due_at_intervals_after_the_first_steps() -> None:
+    """The first after 60 + 4 steps, then one every 4 steps."""
+    learner = SoftQLearner(small_environment, SMALL, 0, CPU)
+    due = []
+    for learner.step in (0, 59, 60, 63, 64, 67, 68, 100):
+        due.append(learner._num_updates_due())
+    assert due == [0, 0, 0, 0, 1, 1, 2, 10]
+
+
+def test_the_gradient_of_an_update_is_that_of_the_mean_loss_of_the_batch() -> None:
+    """The batch is computed in parts, whose gradients are added up."""
+    learner = SoftQLearner(small_environment, replace(SMALL, batch_size=64), 0, CPU)
+    while learner.step < SMALL.learning_starts:
+        learner.train_iteration()
+    rng = deepcopy(learner._rng)
+    batch = learner._buffer.sample_sequences(8, SMALL.sequence_length, rng)
+    assert batch is not None
+    loss, gradients = learner._shard_loss(batch)
+    clipped = [torch.nn.Parameter(torch.zeros_like(gradient)) for gradient in gradients]
+    for parameter, gradient in zip(clipped, gradients, strict=True):
+        parameter.grad = gradient / 64
+    torch.nn.utils.clip_grad_norm_(clipped, 10.0)
+    assert learner._update() == pytest.approx(loss / 64, rel=1e-5)
+    for parameter, expected in zip(learner.network.parameters(), clipped, strict=True):
+        assert parameter.grad is not None
+        assert expected.grad is not None
+        torch.testing.assert_close(parameter.grad, expected.grad, rtol=1e-4, atol=1e-6)
