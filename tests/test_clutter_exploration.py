@@ -242,7 +242,8 @@ def test_ppo_increases_the_probability_of_rewarded_moves(scenes: SceneDataset) -
 
 def entropy(log_probs: torch.Tensor) -> torch.Tensor:
     """Return the entropy of each distribution. Shape of the log-probabilities: (B, N)."""
-    return torch.distributions.Categorical(logits=log_probs).entropy()
+    probabilities = log_probs.exp()
+    return -torch.where(probabilities > 0, probabilities * log_probs, 0.0).sum(dim=1)
 
 
 def test_the_losses_of_ppo_are_means_over_all_moves(scenes: SceneDataset) -> None:

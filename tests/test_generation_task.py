@@ -62,6 +62,7 @@ def test_the_environment_passes_gymnasium_s_checks() -> None:
 
 def test_the_bounds_of_observations() -> None:
     environment = ClutterGeneration(task=GenerationTaskConfig(nodes=9))
+    assert isinstance(environment.observation_space, gymnasium.spaces.Dict)
     spaces = environment.observation_space.spaces
     vocabulary = environment.vocabulary
     bounds = {
