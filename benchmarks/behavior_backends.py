@@ -270,6 +270,8 @@ def _recorded_detail(detail: str) -> str:
     """Return the detail of an outcome as the recorded hashes have it."""
     if placed := re.fullmatch(r"placed with an error of (.*)", detail):
         return f"{placed[1]} from where it was to be"
+    detail = detail.replace("came off the gripper", "came off the cup")
+    detail = detail.replace("the gripper did not grasp the object", "the cup did not seal")
     if moved := re.fullmatch(r"(placed|came off the cup) with a horizontal error of (.*)", detail):
         result = "put down" if moved[1] == "placed" else moved[1]
         return f"{result}, {moved[2]} from where it was to be"

@@ -307,10 +307,10 @@ def test_scenario_files_and_invalid_scenarios(config: ClutterConfig, tmp_path: P
         Scenario(), tmp_path / "scenario.yaml", ["arm.payload=5"], upgrade_config
     )
     cell = scenario.world.cell
-    assert (cell.robot.base.translation, cell.robot.payload, cell.gripper.cups[0].diameter) == (
+    assert (cell.robot.base.translation, cell.robot.payload, cell.gripper.description) == (
         (-0.65, 0.0, 0.3),
         5.0,
-        0.015,
+        "suction, 15 mm",
     )
     with pytest.raises(InputError, match="agent: full-knowledge uses the true state"):
         make_policy("full-knowledge", config)

@@ -95,7 +95,7 @@ def test_an_object_may_share_the_name_of_a_link() -> None:
     """Distances and gradients do not depend on the name."""
     found = {}
     tool = next(iter(DEFAULT_CELL.gripper.tools.values()))
-    for name in (tool.link, "other"):
+    for name in (tool.frame, "other"):
         held, near = (
             resting("gelatin_box", floor=0.2, name="held"),
             resting("sugar_box", xy=(0.1, 0.0), name=name),
@@ -108,4 +108,4 @@ def test_an_object_may_share_the_name_of_a_link() -> None:
             here.pair: gradient for here, gradient in scene.distances_and_gradients(q, 2.0)
         }
     assert np.abs(found["other"]["held", "other"]).max() > 0.01
-    assert found[tool.link]["held", tool.link] == pytest.approx(found["other"]["held", "other"])
+    assert found[tool.frame]["held", tool.frame] == pytest.approx(found["other"]["held", "other"])

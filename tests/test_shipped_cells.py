@@ -40,7 +40,7 @@ def clearance(cell: WorkCell, robot: RobotModel, with_view: bool) -> Callable[[F
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
     instance = add_robot(plant, robot, visuals=False)
-    tool = cell.gripper.model_sdf(compliant=False)
+    tool = cell.gripper.model_sdf(compliant=False, actuated=False)
     (gripper,) = Parser(plant).AddModelsFromString(tool, "sdf")
     flange = plant.GetFrameByName(robot.spec.tool_frame, instance)
     plant.WeldFrames(flange, plant.GetFrameByName("body", gripper))

@@ -19,13 +19,12 @@ from pydrake.multibody.plant import MultibodyPlant
 from drake_clutter.assets import build_assets
 from drake_clutter.catalog import ObjectClass, RestOrientation, Shape, load_catalog
 from drake_clutter.cell.gripper import GraspFailure, GraspFailureReason, GraspSampling, Gripper
+from drake_clutter.cell.payload_limits import GRAVITY, payload_wrench
 from drake_clutter.cell.suction import (
-    GRAVITY,
     MAX_SEAL_GAP,
     SuctionGripper,
     lip_flatness_deviation,
     lip_surface_profile,
-    payload_wrench,
 )
 from drake_clutter.files import InputError
 from drake_clutter.simulation.scene_plant import rigid_transform
@@ -39,7 +38,9 @@ SAMPLING = GraspSampling(spacing=0.012, lip_gap=0.0005, max_grasps=9, min_payloa
 
 def test_fields_of_a_single_cup_change_or_replace_the_cups() -> None:
     """Files of earlier versions have them; several settings add up."""
-    (cup,) = cell_with("gripper.cup_diameter=0.015", "gripper.extension=0.2").gripper.cups
+    gripper = cell_with("gripper.cup_diameter=0.015", "gripper.extension=0.2").gripper
+    assert isinstance(gripper, SuctionGripper)
+    (cup,) = gripper.cups
     assert (cup.diameter, cup.extension, cup.length) == (0.015, 0.2, 0.020)
     assert cup.X_FG.transform.translation() == pytest.approx([0.0, 0.0, 0.1023 + 0.2 + 0.020])
 
@@ -66,12 +67,12 @@ def test_invalid_cups(small: dict[str, Any], message: str) -> None:
 def test_the_model_of_a_gripper_has_a_frame_and_a_mass_for_each_cup() -> None:
     gripper = two_cups(diameter=0.01, length=0.012, extension=0.1, tube_radius=0.005)
     plant = MultibodyPlant(0.0)
-    Parser(plant).AddModelsFromString(gripper.model_sdf(compliant=False), "sdf")
+    Parser(plant).AddModelsFromString(gripper.model_sdf(compliant=False, actuated=False), "sdf")
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("body"))
     plant.Finalize()
     context = plant.CreateDefaultContext()
     for tool in gripper.tools.values():
-        X_FG = plant.GetFrameByName(tool.link).CalcPoseInWorld(context)
+        X_FG = plant.GetFrameByName(tool.frame).CalcPoseInWorld(context)
         assert X_FG.IsNearlyEqualTo(tool.X_FG, 1e-9)
     bar = 2700.0 * math.pi * 0.008**2 * 0.05
     tubes = 0.05 + 0.05 * 0.5**2

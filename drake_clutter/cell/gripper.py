@@ -48,7 +48,7 @@ class Tool:
 
     Attributes:
         name: Name.
-        link: Link of the SDF model whose frame is G.
+        frame: Frame or link of the SDF model that is G.
         X_FG: Pose of G in the flange without load.
         contact_links: Links that touch a grasped object.
         compliant_joint: Index, among the joints of the gripper, of the joint along which the tool
@@ -56,7 +56,7 @@ class Tool:
     """
 
     name: str
-    link: str
+    frame: str
     X_FG: RigidTransform
     contact_links: tuple[str, ...]
     compliant_joint: int | None
@@ -64,23 +64,33 @@ class Tool:
 
 @dataclass(frozen=True)
 class Grasp:
-    """Grasp of a tool at any angle about its axis.
+    """Grasp of a tool.
 
     Attributes:
         tool: Name of the tool.
-        X_TG: Pose of the tool, with its origin on the surface of the object.
+        X_TG: Pose of the tool: of a cup with its origin on the surface of the object.
         payload: Load after the grasp.
+        num_angles: Number of equally good angles about the axis of the tool, evenly spaced; 0 for
+            any angle.
+        insertion: Distance by which the tool reaches below the top of the object [m].
+        joints_open: Positions of the actuated joints before and after the grasp [m].
+        joints_held: Positions of the actuated joints while the object is held [m].
     """
 
     tool: str
     X_TG: RigidTransform
     payload: Payload
+    num_angles: int = 0
+    insertion: float = 0.0
+    joints_open: tuple[float, ...] = ()
+    joints_held: tuple[float, ...] = ()
 
 
 class GraspFailureReason(Enum):
     """Reasons why a gripper has no grasp."""
 
     NO_SEAL = "no seal"
+    NO_OPPOSED_FACES = "no opposed faces"
     TOO_HEAVY = "too heavy"
 
 
@@ -90,7 +100,8 @@ class GraspFailure:
 
     Attributes:
         reason: Failure of the sampled grasp that came closest to being feasible.
-        value: Flatness deviation or gap under the best grasp [m] if no grasp seals, or mass of the
+        value: Flatness deviation or gap under the best grasp [m] if no grasp seals, distance of the
+            narrowest opposed faces or height [m] if none are between the jaws, or mass of the
             object [kg] if it is too heavy.
     """
 
@@ -134,11 +145,21 @@ class Gripper(Protocol):
     def tools(self) -> Mapping[str, Tool]:
         """Tools by name; the first is preferred."""
 
-    def model_sdf(self, *, compliant: bool) -> str:
-        """Return the SDF model; link `body` has frame F, and `Tool.link` frame G of a tool.
+    @property
+    def num_joints(self) -> int:
+        """Number of joints of the model in which all parts can move."""
+
+    @property
+    def num_actuated_joints(self) -> int:
+        """Number of joints that are commanded; they are the first ones."""
+
+    def model_sdf(self, *, compliant: bool, actuated: bool) -> str:
+        """Return the SDF model; link `body` has frame F, and `Tool.frame` is frame G of a tool.
 
         Args:
-            compliant: Whether compliant parts can move; planning uses the rigid model.
+            compliant: Whether compliant parts can move, in a simulation; planning uses the rigid
+                model.
+            actuated: Whether actuated parts can move; else they are fixed, opened.
         """
 
     def sample_grasps(

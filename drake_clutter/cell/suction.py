@@ -11,7 +11,7 @@ lip uniformly, and the lip opens where tension and bending cancel that load.
 
 import math
 from collections.abc import Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -30,6 +30,7 @@ from drake_clutter.cell.gripper import (
     Payload,
     Tool,
 )
+from drake_clutter.cell.payload_limits import max_payload_acceleration
 from drake_clutter.cell.suction_cup import SuctionCup
 from drake_clutter.validation import InRange, StrictModel, rejected_error
 
@@ -37,8 +38,6 @@ Floats = NDArray[np.float64]
 
 ATMOSPHERIC_PRESSURE = 101_325.0
 """Standard atmospheric pressure [Pa]."""
-GRAVITY = 9.81
-"""Gravitational acceleration [m/s^2]."""
 MAX_SEAL_GAP = 0.005
 """Largest lip-to-surface gap at which the vacuum can build up [m]."""
 _NUM_LIP_POINTS = 24
@@ -48,17 +47,6 @@ _RAY_STANDOFF = 0.05
 the lip are seen."""
 _DOWNWARD_ROTATION = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
 """R_TG of a cup that points down."""
-_ACCELERATION_DIRECTIONS = np.array(
-    [
-        [math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)]
-        for e in (-0.8, 0.0, 0.8)
-        for a in np.arange(8) * math.pi / 4
-    ]
-    + [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]
-)
-"""Unit vectors that sample all directions of an acceleration. Shape (26, 3)."""
-
-
 _Mismatch = tuple[bool, float]
 """Of a profile that does not seal: whether it is uneven, and its deviation or gap [m]."""
 
@@ -130,8 +118,18 @@ class SuctionGripper(StrictModel):
         """
         return self.vacuum * ATMOSPHERIC_PRESSURE * math.pi * self.cup(tool).diameter ** 2 / 4
 
-    def model_sdf(self, *, compliant: bool) -> str:
-        """Return the SDF model, see `epick_sdf`."""
+    @property
+    def num_joints(self) -> int:
+        """Bellows of each cup."""
+        return len(self.cups)
+
+    @property
+    def num_actuated_joints(self) -> int:
+        """None: a vacuum holds the objects."""
+        return 0
+
+    def model_sdf(self, *, compliant: bool, actuated: bool) -> str:
+        """Return the SDF model, see `epick_sdf`; no part is actuated."""
         return epick_sdf(self.cups, compliant=compliant)
 
     def sample_grasps(
@@ -212,34 +210,16 @@ class SuctionGripper(StrictModel):
         return bool(_deviation(profile) <= self.unevenness and profile.min() <= MAX_SEAL_GAP)
 
     def max_acceleration(self, tool: str, mass: float, p_GCm: Floats) -> float:
-        """Return the largest acceleration of a load in any direction on a cup that points down.
+        """Return the largest acceleration of a load, see `max_payload_acceleration`.
 
         Args:
             tool: Name of the cup.
             mass: Mass of the load [kg].
             p_GCm: Center of mass of the load [m]. Shape (3,).
-
-        Returns:
-            Acceleration including the safety factor, at most 50 and in steps of 0.01 [m/s^2];
-            negative if the load cannot be held.
         """
-
-        def is_feasible(accelerations: Floats) -> NDArray[np.bool_]:
-            force, moment = payload_wrench(
-                mass, p_GCm, accelerations[:, None, None] * _ACCELERATION_DIRECTIONS
-            )
-            ratios = self.load_ratio(tool, force, moment)
-            return np.asarray(ratios.max(axis=1) * self.safety <= 1)
-
-        low, high = 0.0, 50.0
-        while high - low > 0.01:
-            candidates = np.linspace(low, high, 9)
-            largest = int(np.argmin(np.append(is_feasible(candidates), False))) - 1
-            if largest < 0:
-                return -1.0
-            low = float(candidates[largest])
-            high = float(candidates[min(largest + 1, 8)])
-        return low
+        return max_payload_acceleration(
+            mass, p_GCm, partial(self.load_ratio, tool), 1 / self.safety
+        )
 
     def load_ratio(self, tool: str, force: Floats, moment: Floats) -> Floats:
         """Return the ratio of a load to the load capacity of a cup; it detaches above 1.
@@ -418,20 +398,3 @@ def lip_flatness_deviation(
 def _deviation(profile: Floats) -> float:
     """Return the deviation of a `lip_surface_profile` from a plane [m]; infinite over an edge."""
     return float(np.ptp(profile)) if np.isfinite(profile).all() else math.inf
-
-
-def payload_wrench(mass: float, p_GCm: Floats, acceleration: Floats) -> tuple[Floats, Floats]:
-    """Return force and moment of an accelerated load on a cup that points down.
-
-    Args:
-        mass: Mass of the load [kg].
-        p_GCm: Center of mass of the load [m]. Shape (3,).
-        acceleration: Acceleration of the center of mass in G, without rotation [m/s^2]. Shape
-            (..., 3).
-
-    Returns:
-        Force [N] and moment about G [N m]. Shapes (..., 3).
-    """
-    gravity = np.array([0.0, 0.0, GRAVITY])  # z of G points down.
-    force = mass * (gravity - acceleration)
-    return force, np.cross(np.broadcast_to(p_GCm, force.shape), force)

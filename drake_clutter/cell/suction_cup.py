@@ -54,7 +54,7 @@ class SuctionCup(StrictModel):
 
     @property
     def link(self) -> str:
-        """Link of the SDF model whose frame is G."""
+        """Link of the SDF model, with frame G."""
         return f"{self.name}_cup"
 
     @property

@@ -15,6 +15,7 @@ from pydrake.math import RigidTransform
 
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.fixture import Fixture
+from drake_clutter.cell.parallel_jaw import ParallelJawGripper
 from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.cell.robot_spec import RobotSpec
 from drake_clutter.cell.suction import SuctionGripper
@@ -29,9 +30,8 @@ from drake_clutter.validation import (
 )
 from drake_clutter.yaml_io import read_yaml
 
-GripperSpec = SuctionGripper
-"""Gripper of a cell file. To add a second kind, make it a union of models that satisfy `Gripper`:
-`Annotated[SuctionGripper | OtherGripper, Field(discriminator="kind")]`."""
+GripperSpec = Annotated[SuctionGripper | ParallelJawGripper, Field(discriminator="kind")]
+"""Gripper of a cell file: a model that satisfies `Gripper`."""
 DEFAULT_CELL = "models/cells/ur10_epick_tray.yaml"
 """Resource path of the default cell file."""
 _RESERVED_NAMES = ("tray", "camera", "pedestal", "robot", "gripper")
@@ -54,6 +54,14 @@ class WorkCell(StrictModel):
     support: Support
     cameras: Annotated[dict[NonEmptyText, Camera], Field(min_length=1)]
     fixtures: tuple[Fixture, ...] = ()
+
+    @field_validator("gripper", mode="before")
+    @classmethod
+    def _set_default_kind(cls, gripper: Any) -> Any:
+        """Complete the kind, which earlier files may leave out."""
+        if isinstance(gripper, dict) and "kind" not in gripper:
+            return {"kind": "suction", **gripper}
+        return gripper
 
     @field_validator("fixtures")
     @classmethod

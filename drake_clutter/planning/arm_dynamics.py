@@ -27,7 +27,8 @@ def dynamics_plant(cell: WorkCell, payload: Payload) -> MultibodyPlant:
     """Return a plant of arm, rigid gripper and load alone."""
     plant = MultibodyPlant(0.0)
     robot = add_robot(plant, load_robot(cell.robot), visuals=False)
-    (tool,) = Parser(plant).AddModelsFromString(cell.gripper.model_sdf(compliant=False), "sdf")
+    sdf = cell.gripper.model_sdf(compliant=False, actuated=False)
+    (tool,) = Parser(plant).AddModelsFromString(sdf, "sdf")
     flange = plant.GetFrameByName(cell.robot.tool_frame, robot)
     plant.WeldFrames(flange, plant.GetFrameByName("body", tool))
     if payload.mass:

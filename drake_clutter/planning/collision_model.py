@@ -180,6 +180,11 @@ class CollisionModel:
         self.plant.SetFreeBodyPose(self._context, self._bodies[name], rigid_transform(X_TO))
         self._q = self.plant.GetPositions(self._context)
 
+    def set_gripper_joints(self, positions: Sequence[float]) -> None:
+        """Set the positions of the gripper's actuated joints [m]."""
+        self.plant.SetPositions(self._context, self._arm.gripper, np.array(positions))
+        self._q = self.plant.GetPositions(self._context)
+
     def attach_object(self, name: str, tool: str, X_OG: RigidTransform) -> None:
         """Attach an object to a tool of the gripper.
 

@@ -29,6 +29,7 @@ class PlanningFailureReason(Enum):
 
     NO_FREE_PLACEMENT = "no free spot"
     NO_SEAL = "no seal"
+    NO_OPPOSED_FACES = "no opposed faces"
     TOO_HEAVY = "too heavy"
     CARRIES_OTHERS = "carries others"
     UNREACHABLE = "unreachable"
@@ -146,6 +147,8 @@ class PickPlacePlan:
         X_TO_place: Pose at which the object is released, without guarded descent.
         tool: Name of the tool that holds the object.
         X_OG: Grasp: pose of the tool in the object.
+        joints_open: Positions of the gripper's joints without the object, see `Grasp` [m].
+        joints_held: Positions of the gripper's joints with the object, see `Grasp` [m].
         payload: Load while the object is held.
         segments: `approach`, `carry` and `retreat`.
         num_attempts: Number of combinations of grasp, inverse kinematics solution and transfer
@@ -160,6 +163,8 @@ class PickPlacePlan:
     X_TO_place: Pose
     tool: str
     X_OG: RigidTransform
+    joints_open: tuple[float, ...]
+    joints_held: tuple[float, ...]
     payload: Payload
     segments: tuple[TrajectorySegment, ...]
     num_attempts: int

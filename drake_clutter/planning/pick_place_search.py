@@ -108,7 +108,8 @@ class PickPlaceSearch:
         """
         home = self._robot.home
         tool = self._tools[grasp.tool]
-        yaws = np.arange(self._config.num_yaws) * (2 * math.pi / self._config.num_yaws)
+        num_yaws = grasp.num_angles or self._config.num_yaws
+        yaws = np.arange(num_yaws) * (2 * math.pi / num_yaws)
         X_pick = [self._gripper_pose_at_pick(grasp, yaw) for yaw in yaws]
         X_place = [self._gripper_pose_at_place(X) for X in X_pick]
         q_pick = tool.solve_ik(np.array(X_pick))
@@ -133,6 +134,9 @@ class PickPlaceSearch:
                 X_TG_pick=X_pick[k[0]],
                 X_TG_place=X_place[k[0]],
                 X_OG=RigidTransform(invert_pose(self._X_TO) @ X_pick[k[0]]),
+                insertion=grasp.insertion,
+                joints_open=grasp.joints_open,
+                joints_held=grasp.joints_held,
                 q_pick=q_pick[k],
                 q_place=q_place[k],
             )
@@ -247,6 +251,8 @@ class PickPlaceSearch:
             X_TO_place=self._X_TO_goal,
             tool=candidate.tool,
             X_OG=candidate.X_OG,
+            joints_open=candidate.joints_open,
+            joints_held=candidate.joints_held,
             payload=candidate.payload,
             segments=segments,
             num_attempts=self.num_attempts,

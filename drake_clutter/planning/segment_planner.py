@@ -70,6 +70,9 @@ class GraspCandidate:
         X_TG_pick: Pose of the tool at the grasp. Shape (4, 4).
         X_TG_place: Pose of the tool at the place pose. Shape (4, 4).
         X_OG: Pose of the tool in the object.
+        insertion: Distance by which the tool reaches below the top of the object [m].
+        joints_open: Positions of the gripper's joints without the object, see `Grasp` [m].
+        joints_held: Positions of the gripper's joints with the object, see `Grasp` [m].
         q_pick: Joint positions at the grasp [rad]. Shape (n,).
         q_place: Joint positions at the place pose [rad]. Shape (n,).
     """
@@ -79,6 +82,9 @@ class GraspCandidate:
     X_TG_pick: Floats
     X_TG_place: Floats
     X_OG: RigidTransform
+    insertion: float
+    joints_open: tuple[float, ...]
+    joints_held: tuple[float, ...]
     q_pick: Floats
     q_place: Floats
 
@@ -235,9 +241,13 @@ class SegmentPlanner:
     ) -> tuple[TrajectorySegment, ...] | None:
         """Return approach, carry and retreat, or None after recording a failure."""
         empty = Payload()
-        lift = carry_path.lift
-        lowering = carry_path.reversed_lowering
         tool = self._tools[candidate.tool]
+        # Without the object the tool leaves it upwards before it moves sideways.
+        lift = tool.extend_upwards(carry_path.lift, candidate.insertion)
+        lowering = tool.extend_upwards(carry_path.reversed_lowering, candidate.insertion)
+        if lift is None or lowering is None:
+            self._failures.record(3, PlanningFailureReason.UNREACHABLE, "above the object")
+            return None
         paths_from_lift = tool.paths_home(lift[-1])
         paths_from_lowering = tool.paths_home(lowering[-1])
         # Candidate waypoints and payload of each segment, in the order of planning.
@@ -292,9 +302,13 @@ class SegmentPlanner:
         """Set the pose of the picked object in the collision model for a segment."""
         name = self._picked.name
         X_TO = self._X_TO_place if segment_name == "retreat" else self._picked.X_TO
+        holds = segment_name == "carry"
         self._collision_model.detach_object()
         self._collision_model.set_object_pose(name, X_TO)
-        if segment_name == "carry":
+        self._collision_model.set_gripper_joints(
+            candidate.joints_held if holds else candidate.joints_open
+        )
+        if holds:
             self._collision_model.attach_object(name, candidate.tool, candidate.X_OG)
 
     def _check_segment(
@@ -419,13 +433,16 @@ class SegmentPlanner:
     ) -> GuardedDescent | None:
         """Return the vertical descent from the place pose as far as the arm is free.
 
-        The attached object is ignored: it is expected to touch something.
+        The attached object is ignored: it is expected to touch something. A rigid tool does not
+        descend: it would not yield at contact.
 
         Args:
             candidate: Grasp.
             place: Endpoint at the place pose.
             q_place: Joint positions at the place pose. Shape (n,).
         """
+        if self._cell.gripper.tools[candidate.tool].compliant_joint is None:
+            return None
         X_place = candidate.X_TG_place
         # A thin object may be lowered until the gripper is just above what is below.
         allowed = {

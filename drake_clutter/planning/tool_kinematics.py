@@ -226,6 +226,22 @@ class ToolKinematics:
             return "above the place"
         return CarryPath(lift, tracked, lowering[::-1])
 
+    def extend_upwards(self, path: Floats, distance: float) -> Floats | None:
+        """Return a path with a vertical line of the tool at its end.
+
+        Args:
+            path: Configurations. Shape (k, n).
+            distance: Length of the line [m].
+
+        Returns:
+            Configurations, shape (m, n), or None out of reach.
+        """
+        if distance == 0.0:
+            return path
+        X_TG = self.pose(path[-1])
+        line = self.track(_vertical_line(X_TG, X_TG[2, 3] + distance), path[-1])
+        return None if line is None else np.vstack([path, line[1:]])
+
     def paths_home(self, q: Floats) -> list[Floats]:
         """Return candidate paths to the home configuration. Shapes (m, n).
 

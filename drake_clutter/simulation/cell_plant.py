@@ -80,7 +80,7 @@ def add_work_cell(
     if not any(plant.GetCollisionGeometriesForBody(body) for body in _bodies(plant, robot)):
         problem = f"robot.model: {cell.robot.model!r}: no link has collision geometry"
         raise InputError(f"{problem}; expected a model with collision geometry")
-    sdf = cell.gripper.model_sdf(compliant=compliant)
+    sdf = cell.gripper.model_sdf(compliant=compliant, actuated=True)
     (gripper,) = Parser(plant).AddModelsFromString(sdf, "sdf")
     flange = plant.GetFrameByName(cell.robot.tool_frame, robot)
     plant.WeldFrames(flange, plant.GetFrameByName("body", gripper))
@@ -102,7 +102,7 @@ def add_work_cell(
     filter_collisions(plant, scene_graph, model, robot)
     bodies = _bodies(plant, robot, gripper)
     tools = {
-        name: plant.GetFrameByName(tool.link, gripper) for name, tool in cell.gripper.tools.items()
+        name: plant.GetFrameByName(tool.frame, gripper) for name, tool in cell.gripper.tools.items()
     }
     return Arm(robot, gripper, model.joint_names, bodies, tuple(fixed), flange, tools)
 

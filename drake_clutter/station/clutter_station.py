@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import PdControllerGains, RigidBody
+from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains, RigidBody
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from drake_clutter.catalog import ObjectClass
+from drake_clutter.cell.suction import SuctionGripper
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.scenes.interfaces import ArmState
 from drake_clutter.scenes.scene import SceneObject
@@ -35,6 +36,10 @@ JOINT_STIFFNESS = 1e5
 """Proportional gain of the joint position control [N m/rad]: stiff, as that of industrial arms."""
 JOINT_DAMPING = 2e3
 """Derivative gain of the joint position control [N m s/rad]."""
+JAW_STIFFNESS = 4e4
+"""Proportional gain of the position control of jaws [N/m]."""
+JAW_DAMPING = 200.0
+"""Derivative gain of the position control of jaws [N s/m]."""
 
 
 class ClutterStation(Diagram):
@@ -45,6 +50,7 @@ class ClutterStation(Diagram):
         name: ClutterStation
         input_ports:
         - command
+        - gripper_command
         output_ports:
         - state
         - body_poses
@@ -55,11 +61,14 @@ class ClutterStation(Diagram):
         command: Desired positions [rad], desired velocities [rad/s] and feed-forward torques [N m]
             of n joints. Shape (3 n,).
 
+        gripper_command: Desired positions [m], then desired velocities [m/s] of the m actuated
+            joints of the gripper. Shape (2 m,).
+
     Output ports:
         state: State of the plant. Shape (num_multibody_states,).
         body_poses: Poses of all bodies of the plant in the world, a list of `RigidTransform`.
-        gripper_state: Positions [m], then velocities [m/s] of the gripper's joints: the extensions
-            of the bellows, in the order of the cups. Shape (2 m,).
+        gripper_state: Positions [m], then velocities [m/s] of the gripper's k joints, such as the
+            extensions of the bellows in the order of the cups. Shape (2 k,).
         query: `QueryObject` of `camera_scene_graph`. Only with visuals.
 
     Attributes:
@@ -69,7 +78,7 @@ class ClutterStation(Diagram):
         scene_plant: Plant with the bodies of the objects.
         plant: Plant of arm, cell and objects.
         arm: Frames and bodies of the arm in the plant.
-        grasp: Grasp constraint between a suction cup and an object.
+        grasp: Grasp constraint between a suction cup and an object; None for other grippers.
         free_joints: Free joint of each object that can be locked, by name.
         camera_scene_graph: Scene graph with the visual geometry for cameras; None without visuals.
             It is separate from the scene graph of the contacts, because render engines update
@@ -113,7 +122,8 @@ class ClutterStation(Diagram):
         self.plant = plant = self.scene_plant.plant
         graph = self.scene_plant.scene_graph
         self.arm = add_work_cell(plant, graph, cell, compliant=True, visuals=False)
-        _set_position_gains(plant, self.arm)
+        _set_position_gains(plant, self.arm.robot, JOINT_STIFFNESS, JOINT_DAMPING)
+        _set_position_gains(plant, self.arm.gripper, JAW_STIFFNESS, JAW_DAMPING)
         self.grasp = _make_grasp_constraint(plant, self.arm, cell, self.scene_plant.bodies, weld)
         plant.Finalize()
         self.free_joints = {
@@ -133,6 +143,7 @@ class ClutterStation(Diagram):
             command.get_output_port(0), plant.get_desired_state_input_port(self.arm.robot)
         )
         builder.Connect(command.get_output_port(1), plant.get_actuation_input_port(self.arm.robot))
+        builder.ExportInput(plant.get_desired_state_input_port(self.arm.gripper), "gripper_command")
         builder.ExportOutput(plant.get_state_output_port(), "state")
         builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")
         builder.ExportOutput(plant.get_state_output_port(self.arm.gripper), "gripper_state")
@@ -193,7 +204,8 @@ class ClutterStation(Diagram):
         positions[self._q_indices] = q
         self.plant.SetPositions(context, positions)
         self.plant.SetVelocities(context, np.zeros(self.plant.num_velocities()))
-        self.grasp.reset(context)
+        if self.grasp is not None:
+            self.grasp.reset(context)
         for o in objects:
             X_TO = rigid_transform(o.X_TO)
             if isinstance(self.grasp, WeldGrasp) and o.name == self._weldable_object:
@@ -221,6 +233,35 @@ class ClutterStation(Diagram):
         v = self.plant.GetVelocities(context)[self._v_indices]
         return ArmState(tuple(q.tolist()), tuple(v.tolist()), tuple(torque.tolist()), tool)
 
+    def contact_forces(self, context: Context, link: str) -> dict[str, Floats]:
+        """Return the sums of the contact forces of objects on a link of the gripper.
+
+        Args:
+            context: Context of the plant.
+            link: Name of the link.
+
+        Returns:
+            Forces in T [N], shape (3,), by name of the object.
+        """
+        results = self.plant.get_contact_results_output_port().Eval(context)
+        inspector = self.scene_plant.scene_graph.model_inspector()
+        index = int(self.plant.GetBodyByName(link, self.arm.gripper).index())
+        forces = dict[str, Floats]()
+        for k in range(results.num_hydroelastic_contacts()):
+            info = results.hydroelastic_contact_info(k)
+            surface = info.contact_surface()
+            first, second = (
+                int(self.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)).index())
+                for geometry in (surface.id_M(), surface.id_N())
+            )
+            other = second if first == index else first
+            if index in (first, second) and other in self._object_names:
+                sign = 1.0 if first == index else -1.0
+                force = sign * np.asarray(info.F_Ac_W().translational())
+                name = self._object_names[other]
+                forces[name] = forces.get(name, np.zeros(3)) + force
+        return forces
+
     def objects_in_contact(self, context: Context) -> set[str]:
         """Return the names of objects in contact with the arm or with other objects.
 
@@ -245,12 +286,14 @@ class ClutterStation(Diagram):
         return {self._object_names[body] for body in bodies if body in self._object_names}
 
 
-def _set_position_gains(plant: MultibodyPlant, arm: Arm) -> None:
-    """Set the position control gains of the actuators of the arm."""
-    actuators = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
-    for actuator in actuators:
-        if actuator.model_instance() == arm.robot:
-            actuator.set_controller_gains(PdControllerGains(p=JOINT_STIFFNESS, d=JOINT_DAMPING))
+def _set_position_gains(
+    plant: MultibodyPlant, instance: ModelInstanceIndex, stiffness: float, damping: float
+) -> None:
+    """Set the position control gains of the actuators of a model."""
+    for index in plant.GetJointActuatorIndices():
+        actuator = plant.get_joint_actuator(index)
+        if actuator.model_instance() == instance:
+            actuator.set_controller_gains(PdControllerGains(p=stiffness, d=damping))
 
 
 def _make_grasp_constraint(
@@ -259,8 +302,10 @@ def _make_grasp_constraint(
     cell: WorkCell,
     bodies: Mapping[str, RigidBody],
     weld: WeldPair | None,
-) -> GraspConstraint:
+) -> GraspConstraint | None:
     """Return a `WeldGrasp` of the weldable object, or a `CompliantGrasp` without one."""
+    if not isinstance(cell.gripper, SuctionGripper):
+        return None
     if weld is not None:
         return WeldGrasp(plant, arm, cell.gripper, weld.tool, bodies[weld.object_name])
     return CompliantGrasp(plant, arm, cell.gripper)

@@ -17,6 +17,11 @@ Floats = NDArray[np.float64]
 
 DWELL_TIME = 0.15
 """Time at rest in which the gripper grasps or releases the object [s]."""
+JAW_MOVING_TIME = 0.12
+"""Time in which jaws open or close [s]; less than `DWELL_TIME`."""
+JAW_SQUEEZE = 0.003
+"""Distance by which jaws are commanded to close beyond the surface of the object [m], which takes
+them to their largest force."""
 SAMPLE_PERIOD = 0.01
 """Sample period of the command, which is linearly interpolated [s]."""
 
@@ -34,6 +39,8 @@ class CommandSchedule:
         release_time: Time at which the gripper releases the object [s].
         end_time: Time at which the arm is home again [s].
         stage_starts: Name and start time [s] of each stage.
+        joints_open: Positions of the gripper's actuated joints without the object [m]. Shape (m,).
+        joints_closed: Commanded positions while the object is held [m]. Shape (m,).
     """
 
     command: PiecewisePolynomial
@@ -42,6 +49,24 @@ class CommandSchedule:
     release_time: float
     end_time: float
     stage_starts: tuple[tuple[str, float], ...]
+    joints_open: Floats
+    joints_closed: Floats
+
+    def gripper_joints(self, time: float) -> Floats:
+        """Return the commanded positions of the gripper's actuated joints at a time [s].
+
+        They are 0, fully opened, at the start and at the end of the plan.
+
+        Returns:
+            Positions [m]. Shape (m,).
+        """
+
+        def ramp(start: float) -> float:
+            return min(max((time - start) / JAW_MOVING_TIME, 0.0), 1.0)
+
+        opened = ramp(0.0) - ramp(self.end_time - JAW_MOVING_TIME)
+        closed = ramp(self.grasp_time) - ramp(self.release_time)
+        return opened * self.joints_open + closed * (self.joints_closed - self.joints_open)
 
     def stage_at(self, time: float) -> str:
         """Return the name of the stage at a time [s].
@@ -114,6 +139,8 @@ def build_command_schedule(
         release_time=start_of["release"],
         end_time=time,
         stage_starts=tuple(stage_starts),
+        joints_open=np.array(plan.joints_open),
+        joints_closed=np.array(plan.joints_held) + JAW_SQUEEZE,
     )
 
 

@@ -17,7 +17,8 @@ from pydrake.multibody.plant import DistanceConstraintParams, MultibodyPlant
 from pydrake.multibody.tree import QuaternionFloatingJoint, RigidBody
 from pydrake.systems.framework import Context
 
-from drake_clutter.cell.suction import GRAVITY, SuctionGripper
+from drake_clutter.cell.payload_limits import GRAVITY
+from drake_clutter.cell.suction import SuctionGripper
 from drake_clutter.simulation.cell_plant import Arm
 
 Floats = NDArray[np.float64]

@@ -13,7 +13,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
-from drake_clutter.cell.suction import lip_surface_profile
+from drake_clutter.cell.suction import SuctionGripper, lip_surface_profile
 from drake_clutter.station.clutter_station import ClutterStation
 
 GRIPPER_UPDATE_PERIOD = 0.01
@@ -86,15 +86,24 @@ class SuctionActuator:
         status: Status of the gripper.
     """
 
-    def __init__(self, station: ClutterStation, commanded_tool: Callable[[Context], str]) -> None:
+    def __init__(
+        self,
+        station: ClutterStation,
+        gripper: SuctionGripper,
+        commanded_tool: Callable[[Context], str],
+    ) -> None:
         """Create an actuator.
 
         Args:
-            station: Station with the suction gripper.
+            station: Station with the gripper.
+            gripper: The gripper.
             commanded_tool: Returns the name of the cup whose vacuum is commanded on, "" for none,
                 from the root context.
         """
         self._station = station
+        self._gripper = gripper
+        assert station.grasp is not None
+        self._grasp = station.grasp
         self._commanded_tool = commanded_tool
         self.reset()
 
@@ -128,8 +137,8 @@ class SuctionActuator:
     def _check_overload(self, context: Context, time: float) -> None:
         """Release the object after an overload of `OVERLOAD_RELEASE_TIME`."""
         tool = self.status.tool
-        force, moment = self._station.grasp.load(context, tool)
-        ratio = float(self._station.cell.gripper.load_ratio(tool, force, moment))
+        force, moment = self._grasp.load(context, tool)
+        ratio = float(self._gripper.load_ratio(tool, force, moment))
         max_ratio = max(self.status.max_load_ratio, ratio)
         self.status = replace(self.status, max_load_ratio=max_ratio)
         self._num_overloads = self._num_overloads + 1 if ratio > 1 else 0
@@ -146,9 +155,8 @@ class SuctionActuator:
     def _try_attach(self, context: Context) -> None:
         """Attach the object that is closest below the lip, if the lip seals on it."""
         station = self._station
-        gripper = station.cell.gripper
         tool = self.status.tool
-        diameter = gripper.cup(tool).diameter
+        diameter = self._gripper.cup(tool).diameter
         X_OG = {name: self._cup_pose_in_object(context, name) for name in station.graspable_objects}
         gaps = {
             name: lip_surface_profile(station.object_classes[name], X_OG[name], diameter).min()
@@ -157,13 +165,13 @@ class SuctionActuator:
         if not gaps:
             return
         closest = min(gaps, key=lambda name: gaps[name])
-        if gripper.can_attach(tool, station.object_classes[closest], X_OG[closest]):
-            station.grasp.attach(context, tool, station.scene_plant.bodies[closest])
+        if self._gripper.can_attach(tool, station.object_classes[closest], X_OG[closest]):
+            self._grasp.attach(context, tool, station.scene_plant.bodies[closest])
             self.status = replace(self.status, held=closest, last_held=closest)
             self._X_OG = X_OG[closest]
 
     def _release(self, context: Context) -> None:
         X_OG = self._cup_pose_in_object(context, self.status.held)
         slip = float(np.linalg.norm(X_OG.translation() - self._X_OG.translation()))
-        self._station.grasp.detach(context)
+        self._grasp.detach(context)
         self.status = replace(self.status, held="", slip=slip)

@@ -94,19 +94,22 @@ class PickPlaceExecutor(LeafSystem):
         - gripper_state
         output_ports:
         - command
+        - gripper_command
         - hold
         - finished
         - status
 
     Input ports:
         plan: `PlannedMove`. A plan with a new number starts as soon as the previous one has ended.
-        gripper_state: Positions [m], then velocities [m/s] of the gripper's m joints. A guarded
+        gripper_state: Positions [m], then velocities [m/s] of the gripper's k joints. A guarded
             descent ends when the bellows of the tool are compressed, or at its planned end. Shape
-            (2 m,).
+            (2 k,).
 
     Output ports:
         command: Desired positions [rad], desired velocities [rad/s] and feed-forward torques [N m]
             of n joints. Shape (3 n,).
+        gripper_command: Desired positions [m], then desired velocities [m/s] of the m actuated
+            joints of the gripper. Shape (2 m,).
         hold: 1 for the tool that is commanded to hold an object, else 0; in the order of the
             gripper's tools. Shape (num_tools,).
         finished: Number of the last plan if it has ended, else 0; and distance between planned and
@@ -129,14 +132,22 @@ class PickPlaceExecutor(LeafSystem):
         self._home_command = np.hstack([home, zero, gravity]).ravel()
         self._plan = self.DeclareAbstractInputPort("plan", AbstractValue.Make(PlannedMove()))
         self._tools = cell.gripper.tools
-        num_joints = sum(tool.compliant_joint is not None for tool in self._tools.values())
-        self._gripper_state = self.DeclareVectorInputPort("gripper_state", 2 * num_joints)
+        self._num_actuated_joints = cell.gripper.num_actuated_joints
+        self._gripper_state = self.DeclareVectorInputPort(
+            "gripper_state", 2 * cell.gripper.num_joints
+        )
         self._state = self.DeclareAbstractState(AbstractValue.Make(ExecutorState()))
         self.DeclarePeriodicUnrestrictedUpdateEvent(EXECUTOR_UPDATE_PERIOD, 0.0, self._update)
         self.DeclareInitializationUnrestrictedUpdateEvent(self._update)
         prerequisites = {self.all_state_ticket(), self.time_ticket()}
         self.DeclareVectorOutputPort(
             "command", len(self._home_command), self._calc_command, prerequisites
+        )
+        self.DeclareVectorOutputPort(
+            "gripper_command",
+            2 * self._num_actuated_joints,
+            self._calc_gripper_command,
+            prerequisites,
         )
         self.DeclareVectorOutputPort("hold", len(self._tools), self._calc_hold, prerequisites)
         self.DeclareVectorOutputPort("finished", 2, self._calc_finished, prerequisites)
@@ -203,6 +214,13 @@ class PickPlaceExecutor(LeafSystem):
         else:
             time = state.elapsed(context.get_time())
             output.SetFromVector(state.schedule.command.value(time).ravel())
+
+    def _calc_gripper_command(self, context: Context, output: BasicVector) -> None:
+        state = self.state(context)
+        positions = np.zeros(self._num_actuated_joints)
+        if state.schedule is not None:
+            positions = state.schedule.gripper_joints(state.elapsed(context.get_time()))
+        output.SetFromVector(np.concatenate([positions, np.zeros_like(positions)]))
 
     def _calc_hold(self, context: Context, output: BasicVector) -> None:
         state = self.state(context)

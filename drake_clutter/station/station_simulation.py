@@ -5,7 +5,7 @@ result = simulation.execute(plan)
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,6 +20,7 @@ from drake_clutter.station.body_sleep import BodySleepManager, affected_bodies, 
 from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.grasp_constraint import WeldPair
 from drake_clutter.station.gripper_actuator import GripperActuator, SuctionActuator
+from drake_clutter.station.jaw_actuator import JawActuator
 from drake_clutter.station.messages import PlannedMove
 from drake_clutter.station.pick_place_executor import ExecutorState, PickPlaceExecutor
 
@@ -35,7 +36,10 @@ POST_MOTION_WAIT = 1.0
 AddSystems = Callable[[DiagramBuilder, ClutterStation, PickPlaceExecutor], None]
 """Adds systems to a diagram and connects them, including the input port `plan` of the executor."""
 
-_ACTUATORS = {"suction": SuctionActuator}
+_ACTUATORS: Mapping[str, Callable[..., GripperActuator]] = {
+    "suction": SuctionActuator,
+    "parallel_jaw": JawActuator,
+}
 """Actuator by `Gripper.kind`."""
 
 
@@ -78,9 +82,9 @@ class PickPlaceResult:
 
     def __str__(self) -> str:
         if not self.grasped:
-            return "the cup did not seal"
+            return "the gripper did not grasp the object"
         if not math.isnan(self.drop_time):
-            return f"came off the cup after {self.drop_time:.2f} s"
+            return f"came off the gripper after {self.drop_time:.2f} s"
         millimeters = 1000 * self.position_error
         degrees = math.degrees(self.orientation_error)
         return f"placed with an error of {millimeters:.1f} mm and {degrees:.1f} deg"
@@ -138,6 +142,7 @@ class StationSimulation:
         self.executor = PickPlaceExecutor.AddToBuilder(builder, cell=self.cell)
         for source, target, port in (
             (self.executor, self.station, "command"),
+            (self.executor, self.station, "gripper_command"),
             (self.station, self.executor, "gripper_state"),
         ):
             builder.Connect(source.GetOutputPort(port), target.GetInputPort(port))
@@ -145,7 +150,9 @@ class StationSimulation:
             add_systems(builder, self.station, self.executor)
         self.diagram: Diagram = builder.Build()
         make_actuator = _ACTUATORS[self.cell.gripper.kind]
-        self.gripper: GripperActuator = make_actuator(self.station, self._commanded_tool)
+        self.gripper: GripperActuator = make_actuator(
+            self.station, self.cell.gripper, self._commanded_tool
+        )
         self._sleep = BodySleepManager(self.station)
         self.reset(scene)
 

@@ -245,6 +245,6 @@ class ClosedLoop:
             before, after, picked, X_TO_place, lost_object, self._config.settle
         )
         error = float(np.linalg.norm((after[picked].X_TO.p - X_TO_place.p)[:2]))
-        result = "came off the cup" if lost_object else "placed"
+        result = "came off the gripper" if lost_object else "placed"
         detail = f"{result} with a horizontal error of {1000 * error:.1f} mm"
         return picked, replace(outcome, detail=detail)

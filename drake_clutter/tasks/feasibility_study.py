@@ -292,7 +292,9 @@ class FeasibilityStudy:
         contact_bodies = (*gripper.tools[plan.tool].contact_links, plan.pick)
         for segment in plan.segments:
             collision_model.set_object_poses(scene.objects)
-            if segment.name == "carry":
+            holds = segment.name == "carry"
+            collision_model.set_gripper_joints(plan.joints_held if holds else plan.joints_open)
+            if holds:
                 collision_model.attach_object(plan.pick, plan.tool, X_OG)
             else:
                 collision_model.set_object_pose(
