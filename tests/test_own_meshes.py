@@ -4,6 +4,7 @@
 # mypy: allow-untyped-calls
 
 import math
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -19,17 +20,23 @@ from drake_clutter.assets import build_assets
 from drake_clutter.catalog import ObjectClass, load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
+from drake_clutter.scenes.geometry import objects_resting_on
 from drake_clutter.scenes.interfaces import (
+    Detection,
     InconclusiveReason,
     InconclusiveVerdict,
     Instability,
     InstabilityReason,
+    Move,
+    MoveResult,
     Verdict,
 )
+from drake_clutter.scenes.placement import has_clear_top, resolve_placement
 from drake_clutter.scenes.scene import TRAY, Pose, SceneObject
 from drake_clutter.simulation.camera_renderer import CameraRenderer
 from drake_clutter.simulation.drake_judge import DrakeJudge
 from drake_clutter.stability.ray_caster import RayCaster
+from drake_clutter.stability.static_executor import StaticExecutor
 from drake_clutter.stability.static_judge import StaticStabilityJudge
 
 
@@ -88,25 +95,28 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> dict[str, ObjectClass]:
 
 @pytest.fixture(scope="module")
 def cups(tmp_path_factory: pytest.TempPathFactory) -> dict[str, ObjectClass]:
-    """Return a square cup of 100 x 100 x 60 mm, with a floor and walls of 10 mm.
+    """Return square cups of 100 and 160 mm, 60 mm high, with a floor and walls of 10 mm.
 
-    Its five boxes share no edges, so each is a convex piece.
+    Their five boxes share no edges, so each is a convex piece.
     """
     folder = tmp_path_factory.mktemp("user") / "cups"
     folder.mkdir()
-    slab = trimesh.creation.box((0.0998, 0.0998, 0.01))
-    walls = []
-    for k in range(4):
-        wall = trimesh.creation.box((0.01, 0.0899, 0.05))
-        wall.apply_translation((0.045, 0.0049, 0.03))
-        wall.apply_transform(trimesh.transformations.rotation_matrix(k * math.pi / 2, (0, 0, 1)))
-        walls.append(wall)
-    trimesh.util.concatenate([slab, *walls]).export(folder / "cup.stl")
-    (folder / "catalog.yaml").write_text(
-        "classes: {cup: {shape: mesh, mesh: cup.stl, mass_g: 300}}"
-    )
+    for name, side in (("cup", 0.100), ("bowl", 0.160)):
+        slab = trimesh.creation.box((side - 0.0002, side - 0.0002, 0.01))
+        walls = []
+        for k in range(4):
+            wall = trimesh.creation.box((0.01, side - 0.0101, 0.05))
+            wall.apply_translation((side / 2 - 0.005, 0.0049, 0.03))
+            turn = trimesh.transformations.rotation_matrix(k * math.pi / 2, (0, 0, 1))
+            walls.append(wall.apply_transform(turn))
+        trimesh.util.concatenate([slab, *walls]).export(folder / f"{name}.stl")
+    entries = [
+        f"{name}: {{shape: mesh, mesh: {name}.stl, mass_g: 300}}" for name in ("cup", "bowl")
+    ]
+    (folder / "catalog.yaml").write_text(f"classes: {{{', '.join(entries)}}}")
     build_assets(folder)
-    return {"cup": load_catalog(folder).classes["cup"]}
+    classes = load_catalog(folder).classes
+    return {name: classes[name] for name in ("cup", "bowl")}
 
 
 def as_made(
@@ -308,3 +318,48 @@ def test_a_can_over_the_mouth_of_a_cup_falls_in(
         "can": frozenset({"cup"}),
     }
     assert static_judge.find_instability(inside) is None
+
+
+@pytest.mark.parametrize(
+    ("cup_class", "picked", "floor"),
+    [
+        ("cup", "cracker_box", 0.060),  # across the mouth, on the rim
+        ("cup", "tomato_soup_can", None),  # neither on the rim nor, with its clearance, in the cup
+        ("bowl", "tomato_soup_can", 0.010),  # into the bowl
+        ("bowl", "sugar_box", 0.060),  # 175 x 89 mm: on two sides of the rim
+    ],
+)
+def test_what_is_put_on_or_into_a_cup(
+    cup_class: str,
+    picked: str,
+    floor: float | None,
+    cups: dict[str, ObjectClass],
+    config: ClutterConfig,
+    static_judge: StaticStabilityJudge,
+) -> None:
+    cup = as_made(cups[cup_class], (0.1, 0.05), 0.0, name="cup")
+    scene = scene_of(cup, resting(picked, xy=(-0.15, 0.0), name="picked"))
+    observation, _ = static_judge.ray_caster.observe(scene)
+    move = Move("picked", "cup")
+    command = resolve_placement(move, observation, config.exploration, rng(0))
+    if floor is None:
+        assert command is None
+        return
+    assert command is not None
+    placed = replace(scene["picked"], X_TO=command.X_TO_place)
+    assert placed.bounds_T[0][2] == pytest.approx(floor + 0.001, abs=2e-4)
+    assert placed.X_TO.p[:2] == pytest.approx([0.1, 0.05], abs=0.006)
+    outcome = StaticExecutor(config, static_judge).execute(scene, command, rng(0))
+    assert outcome.result is MoveResult.PLACED
+    assert static_judge.find_supports(outcome.scene) == {
+        "cup": frozenset({TRAY}),
+        "picked": frozenset({"cup"}),
+    }
+    resting_objects = objects_resting_on(outcome.scene["cup"], outcome.scene.objects)
+    assert resting_objects == ("picked",)
+    assert not has_clear_top(static_judge.ray_caster.observe(outcome.scene)[0], detected(cup))
+
+
+def detected(o: SceneObject) -> Detection:
+    """Return an object as a detection without pixels."""
+    return Detection(o.name, o.object_class, o.X_TO, np.zeros((1, 1), np.bool_))

@@ -231,7 +231,8 @@ def objects_resting_on(
     """Return the names of the objects that stand or lean on an object.
 
     The bottom of their bounding boxes is at the top of the object's, and the boxes overlap seen
-    from above.
+    from above. What begins above the bottom of an object that is not convex, such as a bowl, and
+    touches it rests on it, too.
 
     Args:
         carrier: The object that may carry others.
@@ -244,6 +245,10 @@ def objects_resting_on(
             continue
         (lower, upper), (other_lower, other_upper) = carrier.bounds_T, other.bounds_T
         overlap = np.minimum(upper, other_upper)[:2] - np.maximum(lower, other_lower)[:2]
-        if overlap.min() > margin and abs(other_lower[2] - upper[2]) < margin:
+        is_on_top = abs(other_lower[2] - upper[2]) < margin
+        if not is_on_top and len(carrier.object_class.convex_pieces) > 1:
+            is_within = lower[2] + margin < other_lower[2] < upper[2]
+            is_on_top = is_within and penetration_depth(carrier, other) > -margin
+        if overlap.min() > margin and is_on_top:
             names.append(other.name)
     return tuple(names)

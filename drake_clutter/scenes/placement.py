@@ -16,8 +16,11 @@ from drake_clutter.cell.pinhole import MIN_DEPTH, point_to_camera, project
 from drake_clutter.cell.support import Support
 from drake_clutter.compilation import njit
 from drake_clutter.config import ExplorationConfig
+from drake_clutter.scenes.geometry import objects_resting_on
 from drake_clutter.scenes.interfaces import Detection, Move, Observation, PickPlaceCommand
-from drake_clutter.scenes.scene import TRAY, Pose
+from drake_clutter.scenes.scene import TRAY, Pose, SceneObject
+from drake_clutter.stability import equilibrium
+from drake_clutter.stability.shape_table import MAX_LEVEL_DIFFERENCE, ShapeTable
 
 CELL_SIZE = 0.005
 """Side of the grid cells on the support in which placements are searched [m]."""
@@ -27,6 +30,11 @@ _HEIGHT_STEP = 0.020
 """Distance between the heights at which the space above a cell is checked [m]."""
 _EDGE_MARGIN = 0.005
 """Smallest distance of a center of mass from the carrying face's edge [m]."""
+_MAX_OFFSET_FRACTION = 0.25
+"""Largest offset of the centers of mass on an object that is not convex, relative to its width.
+
+Farther off, an object would hang on one side of a rim.
+"""
 _YAWS = (0.0, np.pi / 2)
 """Rotations of the picked object that are tried, in this order [rad]."""
 
@@ -203,6 +211,88 @@ def _top_candidates(
     return cells[order], cost[order]
 
 
+class _Candidates(NamedTuple):
+    """Cells over which the center of mass of a picked object may come to lie.
+
+    Attributes:
+        floor: Height on which the object is put [m].
+        cells: Cells, the best first. Shape (n, 2).
+        cost: Their costs, which do not decrease. Shape (n,).
+    """
+
+    floor: float
+    cells: NDArray[np.int64]
+    cost: NDArray[np.float64]
+
+
+@lru_cache(maxsize=1024)
+def _balanced_offsets(
+    carrier_class: ObjectClass,
+    carrier_quaternion: tuple[float, float, float, float],
+    picked_class: ObjectClass,
+    picked_quaternion: tuple[float, float, float, float],
+) -> tuple[tuple[float, NDArray[np.int64]], ...]:
+    """Return where an object balances on one that is not convex, as on its rim or in it.
+
+    Returns:
+        For each height at which the carrier has level faces, the highest first: the height over its
+        origin [m], and offsets of the centers of mass in cells, the nearest first. Shapes (n, 2).
+    """
+    shapes = ShapeTable()
+    rows = shapes.find_rows(
+        [
+            SceneObject("carrier", carrier_class, Pose((0.0, 0.0, 0.0), carrier_quaternion)),
+            SceneObject("picked", picked_class, Pose((0.0, 0.0, 0.0), picked_quaternion)),
+        ]
+    )
+    table = shapes.arrays.table
+    carrier, picked = table[rows[0]], table[rows[1]]
+    parts = table[carrier["first_part"] : carrier["last_part"]]
+    heights = np.sort(parts["top_z"][parts["top_count"] > 2])[::-1]
+    reach = _MAX_OFFSET_FRACTION * (carrier["upper"] - carrier["lower"])[:2].min() / CELL_SIZE
+    axis = np.arange(-int(reach), int(reach) + 1)
+    offsets = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    distance = np.linalg.norm(offsets, axis=1)
+    order = np.argsort(distance, kind="stable")
+    offsets = offsets[order[distance[order] <= reach]]
+    levels = []
+    while len(heights):
+        p_T = np.column_stack(
+            [
+                offsets * CELL_SIZE + (carrier["com"] - picked["com"])[:2],
+                np.full(len(offsets), heights[0] - picked["bottom_z"]),
+            ]
+        )
+        balanced = equilibrium.balanced_positions(table, rows[0], rows[1], p_T, _EDGE_MARGIN)
+        if balanced.any():
+            levels.append((float(heights[0]), offsets[balanced]))
+        heights = heights[heights < heights[0] - MAX_LEVEL_DIFFERENCE]
+    return tuple(levels)
+
+
+def _candidates_on_pieces(
+    observation: Observation,
+    carrier: Detection,
+    picked_class: ObjectClass,
+    picked_quaternion: tuple[float, float, float, float],
+) -> list[_Candidates]:
+    """Return the cells at which a picked object balances on one that is not convex."""
+    grid = _Grid.over(observation.support)
+    p_Tcm = carrier.X_TO.apply(carrier.object_class.center_of_mass[None])[0]
+    center = np.array([np.abs(grid.x - p_Tcm[0]).argmin(), np.abs(grid.y - p_Tcm[1]).argmin()])
+    levels = _balanced_offsets(
+        carrier.object_class, carrier.X_TO.quaternion, picked_class, picked_quaternion
+    )
+    return [
+        _Candidates(
+            carrier.X_TO.translation[2] + height,
+            center + offsets,
+            np.linalg.norm(offsets, axis=1) * CELL_SIZE,
+        )
+        for height, offsets in levels
+    ]
+
+
 @njit(cache=True)
 def _first_free_cells(depth, camera, x, y, levels, footprint, cells, cost):  # type: ignore[no-untyped-def]
     """Return the first cells above which the footprint is free, all of equal cost.
@@ -265,7 +355,15 @@ def top_height(detection: Detection) -> float:
 
 
 def has_clear_top(observation: Observation, detection: Detection) -> bool:
-    """Return whether the camera sees the space right above an object's whole top."""
+    """Return whether the camera sees the space right above an object's whole top.
+
+    An object that is not convex holds no other detected object, either.
+    """
+    if len(detection.object_class.convex_pieces) > 1:
+        objects = [SceneObject(d.name, d.object_class, d.X_TO) for d in observation.detections]
+        carrier = SceneObject(detection.name, detection.object_class, detection.X_TO)
+        if objects_resting_on(carrier, [o for o in objects if o.name != detection.name]):
+            return False
     corners = detection.X_TO.apply(detection.object_class.corners)
     top = float(corners[:, 2].max())
     grid = _Grid.over(observation.support)
@@ -307,7 +405,9 @@ def find_free_placements(
     occupy, with its clearance. Shadows and the space where the picked object still stands are not
     free. On the support, the placements farthest from the center are returned: there the object
     occludes least and leaves the most room. On an object, the placements nearest to the center of
-    the visible part of its top are returned; the center of mass is over that top.
+    the visible part of its top are returned; the center of mass is over that top. On an object that
+    is not convex, they are those nearest to its center of mass where the picked object balances on
+    level faces of its pieces: across the rim of a cup, or on its floor.
 
     Args:
         observation: Observation before the pick.
@@ -330,33 +430,36 @@ def _search_placements(
 ) -> FreePlacements | None:
     """Return the placements for a move, see `find_free_placements`."""
     picked = observation[move.pick]
-    if move.place == TRAY:
-        floor = 0.0
-        cells, cost = _tray_candidates(observation.support)
-    else:
-        target = observation[move.place]
-        floor = top_height(target)
-        cells, cost = _top_candidates(observation, target)
     grid = _Grid.over(observation.support)
     camera = observation.camera.pinhole
+    target = None if move.place == TRAY else observation[move.place]
+    if target is None:
+        surfaces = [_Candidates(0.0, *_tray_candidates(observation.support))]
+    elif len(target.object_class.convex_pieces) == 1:
+        surfaces = [_Candidates(top_height(target), *_top_candidates(observation, target))]
     for yaw in _YAWS:
         oriented = _orient_object(
             picked.object_class, picked.X_TO.quaternion, yaw, config.clearance
         )
-        height = oriented.height + config.release_height
-        levels = floor + _DEPTH_TOLERANCE + np.arange(0, height, _HEIGHT_STEP)
-        if not observation.camera.is_vertical:
-            # A tilted camera may see the space below the topmost level but not the level itself.
-            levels = np.append(levels, floor + oriented.height + config.release_height)
-        arguments = (grid.x, grid.y, levels, oriented.footprint, cells, cost)
-        best = _first_free_cells(observation.depth, camera, *arguments)
-        if len(best):
-            # Order by cell, so that a random choice does not depend on the sorting by cost.
-            best = best[np.lexsort(cells[best].T[::-1])]
-            z = np.full(len(best), floor + config.release_height - oriented.lowest)
-            xy = grid.centers(cells[best]) - oriented.center_of_mass
-            translations = np.column_stack([xy, z])
-            return FreePlacements(translations, oriented.quaternion)
+        if target is not None and len(target.object_class.convex_pieces) > 1:
+            surfaces = _candidates_on_pieces(
+                observation, target, picked.object_class, oriented.quaternion
+            )
+        for floor, cells, cost in surfaces:
+            height = oriented.height + config.release_height
+            levels = floor + _DEPTH_TOLERANCE + np.arange(0, height, _HEIGHT_STEP)
+            if not observation.camera.is_vertical:
+                # A tilted camera may see the space below the topmost level but not the level.
+                levels = np.append(levels, floor + oriented.height + config.release_height)
+            arguments = (grid.x, grid.y, levels, oriented.footprint, cells, cost)
+            best = _first_free_cells(observation.depth, camera, *arguments)
+            if len(best):
+                # Order by cell, so that a random choice does not depend on the sorting by cost.
+                best = best[np.lexsort(cells[best].T[::-1])]
+                z = np.full(len(best), floor + config.release_height - oriented.lowest)
+                xy = grid.centers(cells[best]) - oriented.center_of_mass
+                translations = np.column_stack([xy, z])
+                return FreePlacements(translations, oriented.quaternion)
     return None
 
 

@@ -113,6 +113,29 @@ def _contains(corners, count, p, x, y, margin):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def balanced_positions(table, lower, upper, p_T, margin):  # type: ignore[no-untyped-def]
+    """Return at which positions an object balances on another one alone.
+
+    Args:
+        table: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
+        lower: Row of the lower object's shape.
+        upper: Row of the upper object's shape.
+        p_T: Positions of the upper object relative to the lower one [m]. Shape (n, 3).
+        margin: Width by which the contact is shrunk [m].
+
+    Returns:
+        Whether the center of mass is over the contact. Shape (n,).
+    """
+    balanced = np.zeros(len(p_T), np.bool_)
+    com = table[upper].com
+    for k in range(len(p_T)):
+        polygon = contact_polygon(table, lower, upper, np.zeros(3), p_T[k], margin)
+        x, y = p_T[k, 0] + com[0], p_T[k, 1] + com[1]
+        balanced[k] = _contains(polygon, len(polygon), np.zeros(3), x, y, 0.0)
+    return balanced
+
+
+@njit(cache=True)
 def _is_stable_tower(table, shapes, p_T, pairs, margin):  # type: ignore[no-untyped-def]
     """Return whether a stack stands in which each object has one contact below.
 
