@@ -111,8 +111,8 @@ def _scene_generator(agent: str, folder: str, nodes: int, seed: int) -> SceneGen
 
 
 SCENES_BY_BATCH = {
-    CrockeryBatch(OBJECT_SET, 12, 0, agent="random"): 200,
-    CrockeryBatch(OBJECT_SET, 12, 0, agent="hill-climbing"): 100,
+    CrockeryBatch(OBJECT_SET, 12, 1, agent="random"): 120,
+    CrockeryBatch(OBJECT_SET, 12, 1, agent="hill-climbing"): 60,
 }
 """Number of scenes of each batch in the published results."""
 

@@ -20,6 +20,10 @@ MAX_MISS_DISTANCE = 0.060
 Such an object is `UNSUPPORTED`: its bottom is at the height of the other object's top, but not
 above it. The distance exceeds the gap of a standing pair (`LayoutConfig.standing_gap`, 50 mm).
 """
+_MIN_CONTACT_WIDTH = 0.002
+"""Narrower parts of the contact of objects that are not convex carry little [m]."""
+_MAX_CENTER_LINE_MARGIN = 0.005
+"""Largest margin up to which a narrow contact keeps its center line [m]."""
 _MAX_OUTLINE_CORNERS = 32
 """Largest number of corners of the contact of objects that are not convex."""
 # Faults that `find_contacts` returns; `InconclusiveReason` explains them.
@@ -173,6 +177,32 @@ def contact_polygon(table, lower_shape, upper_shape, p_lower, p_upper, margin): 
         and table[upper_shape].first_part == upper_shape
     ):
         return _face_contact(table, lower_shape, upper_shape, p_lower, p_upper, margin)
+    # Narrow parts of the contact carry little; they count only if there are no others.
+    outline = _contact_outline(
+        table, lower_shape, upper_shape, p_lower, p_upper, _MIN_CONTACT_WIDTH / 2
+    )
+    if len(outline) == 0:
+        outline = _contact_outline(table, lower_shape, upper_shape, p_lower, p_upper, 0.0)
+    polygon = _shrink(outline, margin)
+    if len(polygon) == 0 and len(outline) > 0 and margin < _MAX_CENTER_LINE_MARGIN:
+        # The contact with a thin rim shrinks to its center line.
+        kept, lost = 0.0, margin
+        while lost - kept > 1e-5:
+            middle = (kept + lost) / 2
+            part = _shrink(outline, middle)
+            if len(part) > 0:
+                kept, polygon = middle, part
+            else:
+                lost = middle
+    return polygon
+
+
+@njit(cache=True)
+def _contact_outline(table, lower_shape, upper_shape, p_lower, p_upper, margin):  # type: ignore[no-untyped-def]
+    """Return the outline of the contacts of pieces at equal height, each shrunk by a margin.
+
+    Its corners are counter-clockwise, at most `_MAX_OUTLINE_CORNERS`. See `contact_polygon`.
+    """
     points = np.empty((256, 2))
     count = 0
     for a in range(table[upper_shape].first_part, table[upper_shape].last_part):
@@ -182,38 +212,39 @@ def contact_polygon(table, lower_shape, upper_shape, p_lower, p_upper, margin): 
             bottom_z = p_upper[2] + table[a].bottom_z
             if abs(bottom_z - p_lower[2] - table[b].top_z) >= MAX_CONTACT_GAP:
                 continue
-            part = _face_contact(table, b, a, p_lower, p_upper, 0.0)
+            part = _face_contact(table, b, a, p_lower, p_upper, margin)
             if count + len(part) > len(points):
                 longer = np.empty((2 * len(points), 2))
                 longer[:count] = points[:count]
                 points = longer
             points[count : count + len(part)] = part
             count += len(part)
-    polygon = np.empty((48, 2))
     if count < 2:
-        return polygon[:0]
+        return points[:0]
     outline = _outline(points[:count])
     if len(outline) < 2:
-        return polygon[:0]
+        return points[:0]
     corners = min(len(outline), _MAX_OUTLINE_CORNERS)
     chosen = np.empty((corners, 2))
     for k in range(corners):
-        chosen[k, 0], chosen[k, 1] = (
-            outline[k * len(outline) // corners, 0],
-            outline[k * len(outline) // corners, 1],
-        )
-    # As in `_face_contact`, start with a square that is larger than the contact.
-    center_x, center_y = (
-        (chosen[:, 0].min() + chosen[:, 0].max()) / 2,
-        (chosen[:, 1].min() + chosen[:, 1].max()) / 2,
-    )
-    half_side = 0.1 + max(
-        chosen[:, 0].max() - chosen[:, 0].min(), chosen[:, 1].max() - chosen[:, 1].min()
-    )
+        chosen[k] = outline[k * len(outline) // corners]
+    return chosen
+
+
+@njit(cache=True)
+def _shrink(outline, margin):  # type: ignore[no-untyped-def]
+    """Return a convex polygon (n, 2) shrunk by a margin, which may be negative. Shape (m, 2)."""
+    polygon = np.empty((48, 2))
+    if len(outline) == 0:
+        return polygon[:0]
+    # As in `_face_contact`, start with a square that is larger than the polygon.
+    left, right = outline[:, 0].min(), outline[:, 0].max()
+    front, back = outline[:, 1].min(), outline[:, 1].max()
+    half_side = 0.1 + max(right - left, back - front)
     for k in range(4):
-        polygon[k, 0] = center_x + (half_side if k in (1, 2) else -half_side)
-        polygon[k, 1] = center_y + (half_side if k in (2, 3) else -half_side)
-    return polygon[: _clip_to(polygon, 4, chosen, corners, 0.0, 0.0, margin)]
+        polygon[k, 0] = (left + right) / 2 + (half_side if k in (1, 2) else -half_side)
+        polygon[k, 1] = (front + back) / 2 + (half_side if k in (2, 3) else -half_side)
+    return polygon[: _clip_to(polygon, 4, outline, len(outline), 0.0, 0.0, margin)]
 
 
 @njit(cache=True)
@@ -396,8 +427,7 @@ def find_contacts(table, shapes, p_T, half_size, is_apart):  # type: ignore[no-u
                             fault, faulty_object, other_object = OVERLAPPING, j, i
                         continue
                     is_near |= overlap > -MAX_MISS_DISTANCE
-                    # Level faces that are not in contact carry nothing.
-                    is_above |= overlap > 0 and (not is_joined or table[b].top_count == 0)
+                    is_above |= overlap > 0
                     may_touch |= overlap > 0
             if not may_touch:
                 continue
