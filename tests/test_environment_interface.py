@@ -40,7 +40,7 @@ def generation() -> ClutterGeneration:
     return environment
 
 
-@pytest.mark.filterwarnings("ignore:.*maximum value is infinity")
+@pytest.mark.filterwarnings("error:.*WARN")
 @pytest.mark.parametrize(
     ("name", "options"),
     [(GENERATION, {}), (EXPLORATION, {}), (EXPLORATION, {"flat_actions": True})],

@@ -391,7 +391,7 @@ class ClutterGeneration(gymnasium.Env[GenerationObservation, int]):
             "edge_links": box(0, n - 1, (e, 2), np.int16),
             "edge_kind": box(0, len(self.vocabulary.edge_kinds), (e,), np.int8),
             "edge_mask": box(0, 1, (e,), np.int8),
-            "remaining_nodes": box(0, np.inf, (1,), np.float32),
+            "remaining_nodes": box(0, n / _REMAINING_NODES_SCALE, (1,), np.float32),
         }
         self.observation_space = gymnasium.spaces.Dict(spaces)  # type: ignore[assignment]
         self.action_space: gymnasium.Space[Any] = gymnasium.spaces.Discrete(len(self.grammar.rules))
