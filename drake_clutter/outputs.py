@@ -119,10 +119,16 @@ def output_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _lock(lock_file: Path, out: Path) -> Iterator[None]:
-    """Hold the lock of an output; at the end, remove the lock file."""
+    """Hold the lock of an output; at the end, remove the lock file.
+
+    An `OSError` without a file name, such as that of a full disk, gets the name of the output.
+    """
     descriptor = _acquire(lock_file, out)
     try:
         yield
+    except OSError as error:
+        error.filename = error.filename or str(out)
+        raise
     finally:
         with suppress(FileNotFoundError):
             lock_file.unlink()

@@ -185,11 +185,7 @@ def _open_journal(path: Path) -> Iterator[FileIO]:
 
 
 def _append(journal: FileIO, text: str) -> None:
-    """Append a text to a journal; an `OSError` names the file."""
+    """Append a text to a journal."""
     data = memoryview(text.encode())
-    try:
-        while data:
-            data = data[journal.write(data) :]
-    except OSError as error:
-        error.filename = str(journal.name)
-        raise
+    while data:
+        data = data[journal.write(data) :]

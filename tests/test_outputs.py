@@ -45,6 +45,17 @@ def test_a_second_writer_is_refused_and_a_killed_one_replaced(lock: Lock, tmp_pa
     assert [path for path in out.parent.rglob("*") if path.is_file()] == []
 
 
+@pytest.mark.parametrize("lock", [output_folder, output_file])
+def test_an_error_without_a_file_name_gets_that_of_the_output(lock: Lock, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(OSError, match="No space") as full, lock(out):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert full.value.filename == str(out)
+    with pytest.raises(FileNotFoundError) as missing, lock(out):
+        (tmp_path / "missing").read_bytes()
+    assert missing.value.filename == str(tmp_path / "missing")
+
+
 def test_a_file_system_without_locks_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

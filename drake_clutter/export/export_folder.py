@@ -74,9 +74,6 @@ def export_scene(scene: Scene, format: ExportFormat, out: Path) -> Path:
             if target.is_dir():  # of the same export, which was killed
                 shutil.rmtree(target)
             os.replace(entry, target)
-    except OSError as error:
-        error.filename = error.filename or str(out)  # a full disk has none
-        raise
     finally:
         shutil.rmtree(staging)
     return out / main_file.name
