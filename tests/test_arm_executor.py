@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from conftest import DEFAULT_CELL, ONE_CUP, cell_with, executed, resting, rng, scene_of
 from pydrake.systems.analysis import Simulator
 
@@ -356,3 +357,34 @@ def test_a_thin_sheet_is_lifted_from_the_tray_and_from_a_box(tmp_path: Path) -> 
     assert not result.lost_object, str(result)
     assert result.position_error < 0.001
     assert result.poses["sheet"].p[2] == pytest.approx(0.037, abs=0.0003)
+
+
+def test_an_open_crate_is_lifted_by_its_floor(tmp_path: Path) -> None:
+    """The cup rises above the walls before it moves sideways."""
+    crate = trimesh.util.concatenate(
+        [
+            trimesh.creation.box(bounds=np.array([lower, upper]) / 1000)
+            for lower, upper in (
+                ((-60, -60, 0), (60, 60, 5)),
+                ((-60, -60, 5.1), (-56, 60, 80)),
+                ((56, -60, 5.1), (60, 60, 80)),
+                ((-55.9, -60, 5.1), (55.9, -56, 80)),
+                ((-55.9, 56, 5.1), (55.9, 60, 80)),
+            )
+        ]
+    )
+    crate.export(tmp_path / "crate.stl")
+    (tmp_path / "catalog.yaml").write_text(
+        "classes:\n  crate: {shape: mesh, mesh: crate.stl, mass_g: 250}\n"
+    )
+    build_assets(tmp_path)
+    crate_class = load_catalog(tmp_path).classes["crate"]
+    scene_object = SceneObject("crate", crate_class, Pose((0.0, 0.0, 0.04), (1.0, 0.0, 0.0, 0.0)))
+    planner = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(optimize=False))
+    X_TO_place = scene_object.X_TO.translated((0.2, 0.1, 0.001))
+    plan = planner.plan([scene_object], "crate", X_TO_place)
+    assert isinstance(plan, PickPlacePlan), plan
+    assert plan.X_OG.translation()[2] == pytest.approx(-0.035 + PlannerConfig().lip_gap, abs=1e-4)
+    result = StationSimulation(DEFAULT_CELL, scene_of(scene_object)).execute(plan)
+    assert result.grasped, str(result)
+    assert result.position_error < 0.001

@@ -48,8 +48,15 @@ _MAX_DENT_FRACTION = 0.02
 """Largest such depth as a fraction of the smallest extent, so that a thin plate keeps its rim."""
 _CONVEX_VOLUME_RATIO = 0.999
 """A mesh whose volume is at least this fraction of its hull's counts as convex."""
+MAX_BULGE = 0.0035
+"""Largest distance of the pieces of a body beyond its surface at which no finer ones are made [m].
+
+A suction cup touches the pieces and seals on the surface below, up to
+`drake_clutter.cell.suction.MAX_SEAL_GAP`, less the gap that the planner leaves above the pieces.
+"""
+_THRESHOLDS = (0.06, 0.04, 0.03)
+"""Concavities up to which CoACD leaves a piece; the first one that obeys `MAX_BULGE` is taken."""
 _COACD_OPTIONS = {
-    "threshold": 0.06,
     "mcts_iterations": 20,
     "mcts_nodes": 10,
     "mcts_max_depth": 2,
@@ -160,14 +167,19 @@ def decompose_convex(mesh: trimesh.Trimesh, where: str) -> list[trimesh.Trimesh]
             continue
         label = f"body {number} of {len(bodies)}: " if len(bodies) > 1 else ""
         low, high = body.bounds
-        # Clipped, because objects are stacked on the bounding box. A piece that is flat afterwards
-        # has no volume, and is left out.
-        clipped = [np.clip(points, low, high) for points in _run_coacd(body, f"{where}: {label}")]
-        pieces += [bounded_hull(points) for points in clipped if not is_flat(points)]
+        for threshold in _THRESHOLDS:
+            corners = _run_coacd(body, threshold, f"{where}: {label}")
+            # Clipped, because objects are stacked on the bounding box. A piece that is flat
+            # afterwards has no volume, and is left out.
+            clipped = [np.clip(points, low, high) for points in corners]
+            hulls = [bounded_hull(points) for points in clipped if not is_flat(points)]
+            if measure_deviation(body, hulls)[0] <= MAX_BULGE:
+                break
+        pieces += hulls
     return pieces
 
 
-def _run_coacd(body: trimesh.Trimesh, prefix: str) -> list[Floats]:
+def _run_coacd(body: trimesh.Trimesh, threshold: float, prefix: str) -> list[Floats]:
     """Return the corners of the convex pieces that CoACD makes of a body [m]. Shapes (V, 3).
 
     CoACD runs in a process of its own, because it cannot be interrupted, and because Drake's SDF
@@ -175,6 +187,7 @@ def _run_coacd(body: trimesh.Trimesh, prefix: str) -> list[Floats]:
 
     Args:
         body: A closed mesh.
+        threshold: Concavity up to which a piece is left.
         prefix: Start of error messages.
     """
     remedy = (
@@ -183,7 +196,8 @@ def _run_coacd(body: trimesh.Trimesh, prefix: str) -> list[Floats]:
     )
     arrays = io.BytesIO()
     np.savez(arrays, vertices=body.vertices, faces=body.faces)
-    command = [sys.executable, "-P", str(_COACD_SCRIPT), json.dumps(_COACD_OPTIONS)]
+    options = {**_COACD_OPTIONS, "threshold": threshold}
+    command = [sys.executable, "-P", str(_COACD_SCRIPT), json.dumps(options)]
     try:
         run = subprocess.run(
             command,

@@ -216,9 +216,11 @@ class PickPlaceSearch:
             if place is None:
                 return None
         gripper_height = candidate.X_TG_pick[2, 3] - self._picked.bounds_T[0][2]
+        # In a bowl or a mug, the gripper rises above the rim before it moves sideways.
+        recess = max(0.0, self._picked.top_height - candidate.X_TG_pick[2, 3])
         for bottom in self._transfer_heights:
             self.num_attempts += 1
-            height = bottom + gripper_height
+            height = bottom + recess + gripper_height
             carry_path = self._tools[candidate.tool].carry_path(
                 candidate.X_TG_pick,
                 candidate.X_TG_place,
