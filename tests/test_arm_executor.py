@@ -373,7 +373,7 @@ def test_an_open_crate_is_lifted_by_its_floor(tmp_path: Path) -> None:
             )
         ]
     )
-    crate.export(tmp_path / "crate.stl")
+    crate.export(tmp_path / "crate.stl")  # type: ignore[no-untyped-call]
     (tmp_path / "catalog.yaml").write_text(
         "classes:\n  crate: {shape: mesh, mesh: crate.stl, mass_g: 250}\n"
     )

@@ -27,7 +27,7 @@ from typing import Any
 
 import pytest
 import typer.main
-from conftest import DEFAULT_CELL
+from conftest import DEFAULT_CELL, training_script
 from typer.testing import CliRunner
 
 from drake_clutter.catalog import load_catalog
@@ -166,7 +166,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / name).symlink_to(ROOT / name)
     for name in ("Makefile", "README.md", "pyproject.toml"):
         (tmp_path / name).symlink_to(ROOT / name)
-    ignore = shutil.ignore_patterns("mug", "package.xml")
+    ignore = shutil.ignore_patterns("mug", "package.xml", "own_objects")
     shutil.copytree(ROOT / "examples", tmp_path / "examples", ignore=ignore)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(feasibility_job, "BASE_GRID_X", [-0.8, -0.6])
@@ -321,14 +321,32 @@ def cli() -> Any:
     return typer.main.get_command(app)
 
 
+def check_options(command: Any, line: str, words: list[str]) -> None:
+    """Fail unless a click command, or the command below it that words begin with, takes them."""
+    words = [word for word in words if word != "..."]
+    while hasattr(command, "commands") and words:
+        command = command.commands[words.pop(0)]
+    context = command.make_context(line, [], resilient_parsing=True)
+    command.make_parser(context).parse_args(words)
+
+
 @each_page
 def test_inline_commands_have_known_options(page: Path) -> None:
     for line in INLINE_COMMAND.findall(prose(page)):
-        words, command = shlex.split(line)[1:], cli()
-        while hasattr(command, "commands") and words:
-            command = command.commands[words.pop(0)]
-        context = command.make_context(line, [], resilient_parsing=True)
-        command.make_parser(context).parse_args([word for word in words if word != "..."])
+        check_options(cli(), line, shlex.split(line)[1:])
+
+
+@each_page
+def test_commands_that_are_not_run_have_known_options(page: Path) -> None:
+    for block in blocks(page):
+        for line in [] if block.run else command_lines(block):
+            match shlex.split(line, comments=True):
+                case ["drake-clutter", *words]:
+                    check_options(cli(), line, words)
+                case ["python", script, *words] if script.startswith("training/"):
+                    app = typer.Typer()
+                    app.command()(training_script(Path(script).stem).main)
+                    check_options(typer.main.get_command(app), line, words)
 
 
 @each_page

@@ -21,6 +21,7 @@ CASES = {
     "07_feasibility_study": ["--count", "1", "--workers", "1"],
     "08_add_object_class": ["--nodes", "6"],
     "09_train_maskable_ppo": ["--steps", "1"],
+    "10_own_objects": [],
 }
 """Options for a short run of each script."""
 HAS_MASKABLE_PPO = importlib.util.find_spec("sb3_contrib") is not None
@@ -40,6 +41,7 @@ def test_script_runs(name: str, tmp_path: Path) -> None:
         target = tmp_path / "examples/custom_class" / file
         target.parent.mkdir(exist_ok=True)
         target.write_bytes(source.read_bytes())
+    (tmp_path / "examples/own_objects").mkdir()
     result = subprocess.run(
         [sys.executable, ROOT / "examples" / f"{name}.py", *CASES[name]],
         cwd=tmp_path,

@@ -317,3 +317,12 @@ def test_every_grasp_on_a_mesh_is_one_that_the_simulation_attaches(tmp_path: Pat
         assert SUCTION.can_attach("single", own, X_OG)
         assert lip_surface_profile(own, X_OG, CUP.diameter).min() <= MAX_SEAL_GAP
         assert grasp.X_TG.translation()[2] == pytest.approx(0.006, abs=0.003)
+
+
+def test_a_plate_has_grasps_at_which_the_cup_seals(tmp_path: Path) -> None:
+    """Its rim is 9 mm above its floor; the convex pieces stay within the reach of the lip."""
+    plate = [(0, 0), (0.055, 0), (0.09, 0.009), (0.09, 0.014), (0.054, 0.005), (0, 0.005)]
+    own = own_class(tmp_path, revolved(plate))
+    grasps = SUCTION.sample_grasps(own, RigidTransform([0.0, 0.0, 0.007]), SAMPLING)
+    assert not isinstance(grasps, GraspFailure)
+    assert grasps[0].X_TG.translation()[2] == pytest.approx(0.005, abs=0.0035 + 1e-6)
