@@ -17,12 +17,12 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import CoulombFriction
-from pydrake.multibody.tree import BodyIndex, Frame, JacobianWrtVariable, RigidBody
+from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.planning.tool_kinematics import invert_pose
+from drake_clutter.planning.shape_table import FoundDistances, ShapeTable
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.occlusion import OccludedBox
 from drake_clutter.scenes.scene import Pose, SceneObject
@@ -51,6 +51,14 @@ class SignedDistance:
     pair: tuple[str, str] = ("", "")
 
 
+@dataclass(frozen=True)
+class _Attached:
+    """Object that is attached to the gripper, with its pose in the flange F."""
+
+    name: str
+    X_FO: RigidTransform
+
+
 class CollisionModel:
     """Collision model of the arm in its cell, with objects at given poses.
 
@@ -76,6 +84,8 @@ class CollisionModel:
             objects: Name and class of each object.
             occluded: Occluded volumes, which count as obstacles.
         """
+        self._robot = load_robot(cell.robot)
+        self._tools = cell.gripper.tools
         builder = DiagramBuilder()
         scene_plant = add_scene_plant(builder, objects, cell.support, 0.0, visuals=False)
         self.plant = plant = scene_plant.plant
@@ -99,20 +109,60 @@ class CollisionModel:
         self._query_port = scene_graph.get_query_output_port()
         self._q = plant.GetPositions(self._context)
         self._q_indices, self._v_indices = joint_state_indices(plant, self._arm)
-        self._geometry_depths = self._find_geometry_depths(load_robot(cell.robot).link_depths)
+        self._geometry_depths = self._find_geometry_depths(self._robot.link_depths)
         self._fixed = (*self._arm.fixed, get_support_body(plant))
         self._names = self._name_geometries()
-        self._geometry_owners = {
-            geometry: (name, geometry in self._geometry_depths)
-            for geometry, name in self._names.items()
-        }
-        self._filters = scene_graph.collision_filter_manager(self._geometry_context)
+        filters = scene_graph.collision_filter_manager(self._geometry_context)
         obstacles = self._geometries(*self._fixed, *self._bodies.values())
-        self._filters.Apply(CollisionFilterDeclaration().ExcludeWithin(obstacles))
+        filters.Apply(CollisionFilterDeclaration().ExcludeWithin(obstacles))
         self.arm_names = frozenset(body.name() for body in self._arm.bodies)
         self.fixture_tops = self._highest_points({fixture.name for fixture in cell.fixtures})
-        self._attached: tuple[str, Frame, Floats] | None = None
-        self._attachment_filters: list[object] = []
+        self._attached: _Attached | None = None
+        self._poses = dict[str, RigidTransform]()
+        self._pairs_by_attached = dict[str, NDArray[np.int64]]()
+        self._collect_shapes()
+
+    def _collect_shapes(self) -> None:
+        """Collect all shapes and the pairs whose distances are computed."""
+        self._q[self._q_indices] = 0.0
+        self.plant.SetPositions(self._context, self._q)
+        query = self._query_port.Eval(self._geometry_context)
+        inspector = query.inspector()
+        self._geometry_ids = [*self._names]
+        self._shape_names = [*self._names.values()]
+        self._shapes = ShapeTable(
+            inspector,
+            {geometry: self._geometry_depths.get(geometry, 0) for geometry in self._names},
+            [query.GetPoseInWorld(geometry).GetAsMatrix4() for geometry in self._names],
+            self._robot.chain,
+            self._robot.X_TB.GetAsMatrix4(),
+        )
+        shape_of = {geometry: shape for shape, geometry in enumerate(self._geometry_ids)}
+        pairs = [
+            (first, second) if first in self._geometry_depths else (second, first)
+            for first, second in inspector.GetCollisionCandidates()
+        ]
+        shapes = sorted((shape_of[first], shape_of[second]) for first, second in pairs)
+        self._pairs = np.array(shapes, np.int64).reshape(-1, 2)
+
+        def shapes_of(body: RigidBody) -> list[int]:
+            return [shape_of[g] for g in self.plant.GetCollisionGeometriesForBody(body)]
+
+        self._object_shapes = {
+            name: [
+                (shape, inspector.GetPoseInFrame(self._geometry_ids[shape]).GetAsMatrix4())
+                for shape in shapes_of(body)
+            ]
+            for name, body in self._bodies.items()
+        }
+        obstacles = (*self._fixed, *self._bodies.values())
+        self._obstacle_shapes = [shape for body in obstacles for shape in shapes_of(body)]
+        self._gripper_shapes = [
+            shape
+            for body in self._arm.bodies
+            if body.model_instance() == self._arm.gripper
+            for shape in shapes_of(body)
+        ]
 
     def _geometries(self, *bodies: RigidBody) -> GeometrySet:
         geometries = GeometrySet()
@@ -172,18 +222,30 @@ class CollisionModel:
         """Detach the attached object and set the poses of objects."""
         self.detach_object()
         for o in objects:
-            self.plant.SetFreeBodyPose(self._context, self._bodies[o.name], rigid_transform(o.X_TO))
+            self._place(o.name, rigid_transform(o.X_TO))
         self._q = self.plant.GetPositions(self._context)
 
     def set_object_pose(self, name: str, X_TO: Pose) -> None:
         """Set the pose of one object."""
-        self.plant.SetFreeBodyPose(self._context, self._bodies[name], rigid_transform(X_TO))
+        self._place(name, rigid_transform(X_TO))
         self._q = self.plant.GetPositions(self._context)
 
     def set_gripper_joints(self, positions: Sequence[float]) -> None:
         """Set the positions of the gripper's actuated joints [m]."""
         self.plant.SetPositions(self._context, self._arm.gripper, np.array(positions))
         self._q = self.plant.GetPositions(self._context)
+        X_FT = self._arm.flange.CalcPoseInWorld(self._context).inverse()
+        query = self._query_port.Eval(self._geometry_context)
+        for shape in self._gripper_shapes:
+            X_FS = X_FT @ query.GetPoseInWorld(self._geometry_ids[shape])
+            self._shapes.attach(shape, X_FS.GetAsMatrix4())
+
+    def _place(self, name: str, X_TO: RigidTransform) -> None:
+        self.plant.SetFreeBodyPose(self._context, self._bodies[name], X_TO)
+        self._poses[name] = X_TO
+        X = X_TO.GetAsMatrix4()
+        for shape, X_OS in self._object_shapes[name]:
+            self._shapes.place(shape, X @ X_OS)
 
     def attach_object(self, name: str, tool: str, X_OG: RigidTransform) -> None:
         """Attach an object to a tool of the gripper.
@@ -197,46 +259,67 @@ class CollisionModel:
             X_OG: Pose of the tool in the object.
         """
         self.detach_object()
-        attached = self._geometries(self._bodies[name])
-        others = self._geometries(*self._fixed, *(b for n, b in self._bodies.items() if n != name))
-        gripper = self._geometries(
-            *(body for body in self._arm.bodies if body.model_instance() == self._arm.gripper)
-        )
-        declaration = (
-            CollisionFilterDeclaration()
-            .ExcludeBetween(attached, gripper)
-            .AllowBetween(attached, others)
-        )
-        self._attachment_filters.append(self._filters.ApplyTransient(declaration))
-        self._attached = name, self._arm.tools[tool], invert_pose(X_OG.GetAsMatrix4())
+        X_FO = self._tools[tool].X_FG @ X_OG.inverse()
+        X = X_FO.GetAsMatrix4()
+        for shape, X_OS in self._object_shapes[name]:
+            self._shapes.attach(shape, X @ X_OS)
+        self._attached = _Attached(name, X_FO)
 
     def detach_object(self) -> None:
-        """Detach the attached object, if any; it stays at its last pose."""
-        while self._attachment_filters:
-            self._filters.RemoveDeclaration(self._attachment_filters.pop())
-        self._attached = None
-
-    def _pairs_below(self, q: Floats, max_distance: float) -> list[SignedDistancePair]:
-        self._q[self._q_indices] = q
-        self.plant.SetPositions(self._context, self._q)
+        """Detach the attached object, if any; it stays where it was before it was attached."""
         if self._attached is not None:
-            name, frame, X_GO = self._attached
-            X_TG = frame.CalcPoseInWorld(self._context).GetAsMatrix4()
-            self.plant.SetFreeBodyPose(
-                self._context, self._bodies[name], RigidTransform(X_TG @ X_GO)
-            )
-        query = self._query_port.Eval(self._geometry_context)
-        pairs: list[SignedDistancePair] = query.ComputeSignedDistancePairwiseClosestPoints(
-            max_distance
-        )
-        return pairs
+            name = self._attached.name
+            self._attached = None
+            self._place(name, self._poses[name])
 
-    def _to_signed_distance(self, pair: SignedDistancePair) -> SignedDistance:
-        first, first_is_arm = self._geometry_owners[pair.id_A]
-        second, _ = self._geometry_owners[pair.id_B]
-        first_moves = first_is_arm or (self._attached is not None and first == self._attached[0])
-        names = (first, second) if first_moves else (second, first)
-        return SignedDistance(float(pair.distance), names)
+    def _attached_pairs(self, name: str) -> NDArray[np.int64]:
+        """Return the pairs of shapes whose distances are computed if an object is attached.
+
+        Those between the object and the gripper are left out, those between it and obstacles are
+        added. The pairs of shapes have moving ones first. Shape (p, 2).
+        """
+        if name not in self._pairs_by_attached:
+            attached = [shape for shape, _ in self._object_shapes[name]]
+            is_attached = np.isin(self._pairs, attached).any(axis=1)
+            with_gripper = is_attached & np.isin(self._pairs, self._gripper_shapes).any(axis=1)
+            links = self._pairs[is_attached & ~with_gripper]
+            others = [shape for shape in self._obstacle_shapes if shape not in attached]
+            added = [(shape, other) for shape in attached for other in others]
+            self._pairs_by_attached[name] = np.vstack(
+                [self._pairs[~is_attached], links[:, ::-1], np.array(added, np.int64)]
+            )
+        return self._pairs_by_attached[name]
+
+    def distances_along(
+        self, path: Floats, max_distance: float
+    ) -> list[tuple[int, SignedDistance]]:
+        """Return the signed distances below a threshold along a path.
+
+        Args:
+            path: Joint positions of the arm. Shape (m, n).
+            max_distance: Threshold [m].
+
+        Returns:
+            Pairs of the row of the path and a distance, in the order of the path.
+        """
+        found = self._find_distances(path, max_distance, with_gradients=False)
+        return list(zip(found.rows.tolist(), self._to_signed_distances(found), strict=True))
+
+    def distances_and_gradients_along(
+        self, path: Floats, max_distance: float
+    ) -> tuple[NDArray[np.int64], list[SignedDistance], Floats]:
+        """Return the signed distances below a threshold along a path with their gradients.
+
+        Args:
+            path: Joint positions of the arm. Shape (m, n).
+            max_distance: Threshold [m].
+
+        Returns:
+            Rows of the path, shape (k,), k distances, and their derivatives by the joint positions
+            [m/rad], shape (k, n).
+        """
+        found = self._find_distances(path, max_distance, with_gradients=True)
+        return found.rows, self._to_signed_distances(found), found.gradients
 
     def distances_below(self, q: Floats, max_distance: float) -> list[SignedDistance]:
         """Return the signed distances below a threshold.
@@ -245,7 +328,7 @@ class CollisionModel:
             q: Joint positions of the arm. Shape (n,).
             max_distance: Threshold [m].
         """
-        return [self._to_signed_distance(pair) for pair in self._pairs_below(q, max_distance)]
+        return [distance for _, distance in self.distances_along(q[None], max_distance)]
 
     def distances_and_gradients(
         self, q: Floats, max_distance: float
@@ -260,33 +343,90 @@ class CollisionModel:
             Pairs of a signed distance and its derivatives by the joint positions [m/rad], shape
             (n,), in the order of `distances_below`.
         """
-        pairs = self._pairs_below(q, max_distance)
-        if not pairs:
-            return []
+        _, distances, gradients = self.distances_and_gradients_along(q[None], max_distance)
+        return list(zip(distances, gradients, strict=True))
+
+    def _to_signed_distances(self, found: FoundDistances) -> list[SignedDistance]:
+        names = self._shape_names
+        pairs = found.pairs.tolist()
+        return [
+            SignedDistance(distance, (names[first], names[second]))
+            for distance, (first, second) in zip(found.distances.tolist(), pairs, strict=True)
+        ]
+
+    def _find_distances(
+        self, path: Floats, max_distance: float, *, with_gradients: bool
+    ) -> FoundDistances:
+        pairs = self._pairs
+        if self._attached is not None:
+            pairs = self._attached_pairs(self._attached.name)
+        found = self._shapes.find_distances(
+            path, pairs, max_distance, with_gradients=with_gradients
+        )
+        is_kept = np.ones(len(found.rows), bool)
+        for k in np.flatnonzero(np.isnan(found.distances)):
+            # Depths of penetration and rare shapes are Drake's.
+            pair = self._query_pair(path[found.rows[k]], found.pairs[k])
+            found.distances[k] = pair.distance if pair else 0.0
+            is_kept[k] = found.distances[k] <= max_distance
+            if with_gradients:
+                found.gradients[k] = self._gradient(pair) if pair else 0.0
+        return found if is_kept.all() else found.select(is_kept)
+
+    def _query_pair(self, q: Floats, shapes: NDArray[np.int64]) -> SignedDistancePair | None:
+        """Return Drake's result for two shapes, which sets the context to joint positions.
+
+        Returns:
+            The result, or None for shapes that just touch: FCL, Drake's library of distances, fails
+            on some of them.
+        """
+        self._q[self._q_indices] = q
+        self.plant.SetPositions(self._context, self._q)
+        if self._attached is not None:
+            name = self._attached.name
+            X_TF = self._arm.flange.CalcPoseInWorld(self._context)
+            self.plant.SetFreeBodyPose(
+                self._context, self._bodies[name], X_TF @ self._attached.X_FO
+            )
+        query = self._query_port.Eval(self._geometry_context)
+        try:
+            pair: SignedDistancePair = query.ComputeSignedDistancePairClosestPoints(
+                *(self._geometry_ids[shape] for shape in shapes)
+            )
+        except RuntimeError:
+            return None
+        return pair
+
+    def _gradient(self, pair: SignedDistancePair) -> Floats:
+        """Return the gradient of a pair at the positions in the context [m/rad]. Shape (n,)."""
         query = self._query_port.Eval(self._geometry_context)
         world = self.plant.world_frame()
         J = self.plant.CalcJacobianSpatialVelocity(
             self._context, JacobianWrtVariable.kV, self._arm.flange, np.zeros(3), world, world
         )[:, self._v_indices]
         p_TF = self._arm.flange.CalcPoseInWorld(self._context).translation()
-        distances = []
-        for pair in pairs:
-            gradient = np.zeros(len(self._q_indices))
-            for geometry, p_GeometryC, sign in (
-                (pair.id_A, pair.p_ACa, 1.0),
-                (pair.id_B, pair.p_BCb, -1.0),
-            ):
-                if depth := self._num_moving_joints(geometry):
-                    nx, ny, nz = sign * pair.nhat_BA_W
-                    x, y, z = query.GetPoseInWorld(geometry).multiply(p_GeometryC) - p_TF
-                    moment = (y * nz - z * ny, z * nx - x * nz, x * ny - y * nx)  # p_FC x n
-                    gradient[:depth] += (*moment, nx, ny, nz) @ J[:, :depth]
-            distances.append((self._to_signed_distance(pair), gradient))
-        return distances
+        gradient = np.zeros(len(self._q_indices))
+        for geometry, p_GeometryC, sign in (
+            (pair.id_A, pair.p_ACa, 1.0),
+            (pair.id_B, pair.p_BCb, -1.0),
+        ):
+            if depth := self._num_moving_joints(geometry):
+                nx, ny, nz = sign * pair.nhat_BA_W
+                x, y, z = query.GetPoseInWorld(geometry).multiply(p_GeometryC) - p_TF
+                moment = (y * nz - z * ny, z * nx - x * nz, x * ny - y * nx)  # p_FC x n
+                gradient[:depth] += (*moment, nx, ny, nz) @ J[:, :depth]
+        return gradient
 
-    def tool_position(self, tool: str) -> Floats:
-        """Return p_TG of a tool at the positions of the last distance query [m]. Shape (3,)."""
-        return np.asarray(self._arm.tools[tool].CalcPoseInWorld(self._context).translation())
+    def tool_positions(self, tool: str, path: Floats) -> Floats:
+        """Return p_TG of a tool along a path [m]. Shape (m, 3).
+
+        Args:
+            tool: Name of the tool.
+            path: Joint positions of the arm. Shape (m, n).
+        """
+        X_TF = self._robot.X_TB.GetAsMatrix4() @ self._robot.forward_kinematics(path)
+        p_FG = self._tools[tool].X_FG.translation()
+        return np.asarray(X_TF[:, :3, :3] @ p_FG + X_TF[:, :3, 3])
 
     def tool_jacobian(self, tool: str, q: Floats) -> Floats:
         """Return the spatial Jacobian of G in T, angular rows first. Shape (6, n).
@@ -309,8 +449,7 @@ class CollisionModel:
         return np.asarray(J[:, self._v_indices])
 
     def _num_moving_joints(self, geometry: GeometryId) -> int:
-        name, is_arm = self._geometry_owners[geometry]
-        if is_arm:
+        if geometry in self._geometry_depths:
             return self._geometry_depths[geometry]
-        is_attached = self._attached is not None and name == self._attached[0]
+        is_attached = self._attached is not None and self._names[geometry] == self._attached.name
         return len(self._q_indices) if is_attached else 0

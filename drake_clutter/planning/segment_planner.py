@@ -34,7 +34,7 @@ from drake_clutter.planning.time_parameterization import (
 )
 from drake_clutter.planning.tool_kinematics import CarryPath, ToolKinematics, raise_pose
 from drake_clutter.planning.trajectory_optimization import (
-    LinearizedDistance,
+    LinearizedDistances,
     TrajectoryOptimizationProblem,
     optimize_trajectory,
 )
@@ -160,29 +160,39 @@ class SegmentPlanner:
         """
         closest = SignedDistance(math.inf)
         min_distance = self._config.min_distance
-        for q in path:
-            for distance in self._collision_model.distances_below(q, MAX_REPORTED_DISTANCE):
-                required = self._required_distance(distance, endpoint, min_distance)
-                if distance.distance < required:
-                    self._failures.record(
-                        progress,
-                        PlanningFailureReason.IN_COLLISION,
-                        f"{stage}: {' and '.join(distance.pair)}",
-                        distance.distance,
-                    )
-                    return None
-                if (
-                    required == min_distance
-                    and distance.distance < closest.distance
-                    and distance.pair[1] not in self._collision_model.arm_names
-                ):
-                    closest = distance
+        offsets = self._endpoint_offsets(path, endpoint)
+        for row, distance in self._collision_model.distances_along(path, MAX_REPORTED_DISTANCE):
+            required = self._required_distance(distance, endpoint, offsets[row], min_distance)
+            if distance.distance < required:
+                self._failures.record(
+                    progress,
+                    PlanningFailureReason.IN_COLLISION,
+                    f"{stage}: {' and '.join(distance.pair)}",
+                    distance.distance,
+                )
+                return None
+            if (
+                required == min_distance
+                and distance.distance < closest.distance
+                and distance.pair[1] not in self._collision_model.arm_names
+            ):
+                closest = distance
         return closest
 
+    def _endpoint_offsets(self, path: Floats, endpoint: EndpointContext) -> list[float]:
+        """Return the horizontal distances of the tool from an endpoint along a path [m]."""
+        p_TG = self._collision_model.tool_positions(endpoint.tool, path)
+        offsets: list[float] = np.linalg.norm(p_TG[:, :2] - endpoint.p_TG_xy, axis=1).tolist()
+        return offsets
+
     def _required_distance(
-        self, distance: SignedDistance, endpoint: EndpointContext, min_distance: float
+        self,
+        distance: SignedDistance,
+        endpoint: EndpointContext,
+        offset: float,
+        min_distance: float,
     ) -> float:
-        """Return the required distance of a pair at the last query's configuration [m].
+        """Return the required distance of a pair [m].
 
         The gripper may touch the picked object, and the attached object may touch its neighbors at
         the endpoint. The required distance grows with the horizontal distance from the endpoint.
@@ -190,6 +200,7 @@ class SegmentPlanner:
         Args:
             distance: Distance of the pair.
             endpoint: Endpoint near which smaller distances are allowed.
+            offset: Horizontal distance of the tool from the endpoint [m].
             min_distance: Required distance of all other pairs [m].
         """
         if distance.pair in self._grasp_contacts[endpoint.tool]:
@@ -198,8 +209,7 @@ class SegmentPlanner:
             allowed = endpoint.allowed_distances[distance.pair]
         else:
             return min_distance
-        offset = self._collision_model.tool_position(endpoint.tool)[:2] - endpoint.p_TG_xy
-        return min(min_distance, allowed + float(np.linalg.norm(offset)))
+        return min(min_distance, allowed + offset)
 
     def distances_below_object(
         self, candidate: GraspCandidate, q: Floats, below: Set[str]
@@ -386,17 +396,25 @@ class SegmentPlanner:
         is_carry = segment.name == "carry"
         arm_context = self._arm_context(segment.name, endpoints)
 
-        def nearby_distances(q: Floats, s: float) -> list[LinearizedDistance]:
-            context = endpoints[int(s >= 0.5)] if is_carry else arm_context
-            linearized = []
-            for distance, gradient in self._collision_model.distances_and_gradients(
+        def nearby_distances(q: Floats, s: Floats) -> LinearizedDistances:
+            contexts = [endpoints[int(at >= 0.5)] if is_carry else arm_context for at in s]
+            offsets = [
+                self._endpoint_offsets(q, context)
+                for context in (endpoints if is_carry else (arm_context, arm_context))
+            ]
+            rows, distances, gradients = self._collision_model.distances_and_gradients_along(
                 q, INFLUENCE_DISTANCE
-            ):
-                required = self._required_distance(distance, context, min_distance)
-                # Distances between neighboring wrist links are constant.
-                if np.abs(gradient).max() > 1e-6:
-                    linearized.append(LinearizedDistance(gradient, distance.distance - required))
-            return linearized
+            )
+            slack = [
+                distance.distance
+                - self._required_distance(
+                    distance, contexts[row], offsets[int(s[row] >= 0.5)][row], min_distance
+                )
+                for row, distance in zip(rows, distances, strict=True)
+            ]
+            # Distances between neighboring wrist links are constant.
+            varies = np.abs(gradients).max(axis=1, initial=0.0) > 1e-6
+            return LinearizedDistances(rows[varies], gradients[varies], np.array(slack)[varies])
 
         limits = MotionLimits(self._cell, payload)
         problem = TrajectoryOptimizationProblem(

@@ -87,16 +87,18 @@ def _derivative_matrix(order: int, num_joints: int) -> sparse.csr_matrix:
 
 
 @dataclass(frozen=True)
-class LinearizedDistance:
-    """First-order model of a signed distance.
+class LinearizedDistances:
+    """First-order models of signed distances at configurations of a path.
 
     Attributes:
-        gradient: Derivative by the joint positions [m/rad]. Shape (n,).
-        slack: Distance minus required distance [m].
+        rows: Indices of the configurations. Shape (k,).
+        gradients: Derivatives by the joint positions [m/rad]. Shape (k, n).
+        slack: Distances minus required distances [m]. Shape (k,).
     """
 
-    gradient: Floats
-    slack: float
+    rows: NDArray[np.int64]
+    gradients: Floats
+    slack: Floats
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,7 @@ class TrajectoryOptimizationProblem:
         max_tool_speed: Largest speed of the tool [m/s]; infinite without a limit.
         max_tool_acceleration: Largest acceleration of the tool along each axis [m/s^2].
         nearby_distances: Returns all distances below the influence distance, from joint positions
-            of shape (n,) and the path parameter s in [0, 1].
+            of shape (m, n) and the path parameters s in [0, 1] of shape (m,).
         tool_jacobian: Returns the spatial Jacobian of the tool, angular rows first, shape (6, n),
             from joint positions of shape (n,).
         tool_axis: Returns the z axis of the tool in T, shape (3,), from joint positions of shape
@@ -126,7 +128,7 @@ class TrajectoryOptimizationProblem:
     keep_tool_vertical: bool
     max_tool_speed: float
     max_tool_acceleration: float
-    nearby_distances: Callable[[Floats, float], list[LinearizedDistance]]
+    nearby_distances: Callable[[Floats, Floats], LinearizedDistances]
     tool_jacobian: Callable[[Floats], Floats]
     tool_axis: Callable[[Floats], Floats]
 
@@ -252,17 +254,11 @@ def _limit_constraints(
         constraints.add_two_sided(
             _derivative_matrix(3, n), 1.5 * duration * jerks, -jerks * duration**3 / 2
         )
-    samples = [
-        (k, distance)
-        for k, s in enumerate(_SAMPLE_PARAMETERS)
-        for distance in problem.nearby_distances(q[k], s)
-    ]
-    if samples:
-        index = np.array([k for k, _ in samples])
-        gradients = np.array([distance.gradient for _, distance in samples])
-        slack = np.array([distance.slack for _, distance in samples])
+    nearby = problem.nearby_distances(q, _SAMPLE_PARAMETERS)
+    if len(nearby.rows):
+        index, gradients = nearby.rows, nearby.gradients
         is_near_end = np.minimum(_SAMPLE_PARAMETERS, 1 - _SAMPLE_PARAMETERS) < ENDPOINT_FRACTION
-        slack = np.where(is_near_end[index], np.maximum(slack, 0.0), slack)
+        slack = np.where(is_near_end[index], np.maximum(nearby.slack, 0.0), nearby.slack)
         constraints.add(
             _directional_matrix(-_VALUE_WEIGHTS[index], gradients),
             np.zeros(len(index)),

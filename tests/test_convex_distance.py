@@ -1,0 +1,178 @@
+"""Compiled distances of convex shapes against closed forms and against Drake's."""
+
+import math
+from itertools import product
+
+import numpy as np
+import pytest
+from conftest import cell_with, resting, rng
+from numpy.typing import NDArray
+from pydrake.geometry import (
+    Box,
+    Capsule,
+    Convex,
+    Cylinder,
+    Ellipsoid,
+    FramePoseVector,
+    GeometryFrame,
+    GeometryInstance,
+    ProximityProperties,
+    SceneGraph,
+    Shape,
+    Sphere,
+)
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from drake_clutter.planning.collision_model import CollisionModel
+from drake_clutter.planning.shape_table import ShapeTable
+from drake_clutter.robots.robot_model import load_robot
+from drake_clutter.robots.serial_chain import SerialChain
+from drake_clutter.simulation.scene_plant import rigid_transform
+
+Floats = NDArray[np.float64]
+STEP = 1e-5
+"""Displacement for numerical derivatives [m]."""
+
+TETRAHEDRON = np.array([[0.1, 0.0, 0.0], [-0.1, 0.1, 0.0], [-0.1, -0.1, 0.0], [0.0, 0.0, 0.2]])
+SHAPES = {
+    "box": Box(0.3, 0.2, 0.1),
+    "cylinder": Cylinder(0.06, 0.2),
+    "capsule": Capsule(0.05, 0.3),
+    "sphere": Sphere(0.08),
+    "convex": Convex(TETRAHEDRON.T, "tetrahedron"),
+}
+
+
+class Pair:
+    """A shape on a prismatic joint along x, and a fixed shape, here and in Drake."""
+
+    def __init__(self, moving: Shape, fixed: Shape) -> None:
+        self._scene_graph = SceneGraph()
+        self._source = self._scene_graph.RegisterSource("pair")
+        self._frames, geometries = [], []
+        for name, shape in (("moving", moving), ("fixed", fixed)):
+            frame = self._scene_graph.RegisterFrame(self._source, GeometryFrame(name))
+            instance = GeometryInstance(RigidTransform(), shape, name)
+            instance.set_proximity_properties(ProximityProperties())
+            geometries.append(self._scene_graph.RegisterGeometry(self._source, frame, instance))
+            self._frames.append(frame)
+        self.geometries = geometries
+        along_x = np.array(
+            [[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+        )
+        self._chain = SerialChain(np.array([along_x, np.eye(4)]), np.array([False]))
+
+    def distance(
+        self, X_moving: RigidTransform, X_fixed: RigidTransform, threshold: float = 10.0
+    ) -> tuple[float, float]:
+        """Return the compiled distance and its derivative along x; NaN if cores intersect."""
+        table = ShapeTable(
+            self._scene_graph.model_inspector(),
+            {self.geometries[0]: 1, self.geometries[1]: 0},
+            [X_moving.GetAsMatrix4(), X_fixed.GetAsMatrix4()],
+            self._chain,
+            np.eye(4),
+        )
+        pairs = np.array([[0, 1]])
+        found = table.find_distances(np.zeros((1, 1)), pairs, threshold, with_gradients=True)
+        if not len(found.distances):
+            return math.inf, 0.0
+        return float(found.distances[0]), float(found.gradients[0, 0])
+
+    def drake_distance(self, X_moving: RigidTransform, X_fixed: RigidTransform) -> float:
+        """Return the distance according to Drake."""
+        context = self._scene_graph.CreateDefaultContext()
+        poses = FramePoseVector()
+        poses.set_value(self._frames[0], X_moving)
+        poses.set_value(self._frames[1], X_fixed)
+        self._scene_graph.get_source_pose_port(self._source).FixValue(context, poses)
+        query = self._scene_graph.get_query_output_port().Eval(context)
+        return float(query.ComputeSignedDistancePairClosestPoints(*self.geometries).distance)
+
+
+def random_pose(generator: np.random.Generator, spread: float) -> RigidTransform:
+    angles = generator.uniform(-math.pi, math.pi, 3)
+    return RigidTransform(RollPitchYaw(angles), generator.uniform(-spread, spread, 3))
+
+
+@pytest.mark.parametrize(("first", "second"), [*product(SHAPES, SHAPES)])
+def test_distances_are_those_of_drake(first: str, second: str) -> None:
+    """Drake finds the nearest points of curved shapes by iteration, and stops early.
+
+    The distance is that of two points of the shapes, so that a smaller one is the better one.
+    """
+    pair = Pair(SHAPES[first], SHAPES[second])
+    is_curved = bool({"cylinder", "capsule"} & {first, second})
+    generator = rng(5)
+    num_compared = 0
+    for _ in range(40):
+        X_A, X_B = (random_pose(generator, 0.4) for _ in range(2))
+        distance, gradient = pair.distance(X_A, X_B)
+        drake = pair.drake_distance(X_A, X_B)
+        if math.isnan(distance):
+            assert drake < 1e-6
+            continue
+        num_compared += 1
+        assert distance <= drake + 1e-6
+        assert distance >= drake - (1e-3 if is_curved else 1e-4)
+        assert pair.distance(X_A, X_B, threshold=distance - 1e-6)[0] == math.inf
+        ahead, behind = (
+            pair.distance(RigidTransform([sign * STEP, 0.0, 0.0]) @ X_A, X_B)[0] for sign in (1, -1)
+        )
+        if max(ahead, behind) - distance < 0.3 * STEP or abs(ahead + behind - 2 * distance) < 1e-8:
+            assert gradient == pytest.approx((ahead - behind) / (2 * STEP), abs=0.02)
+    assert num_compared > 20
+
+
+def test_distances_of_capsules_equal_those_of_their_segments() -> None:
+    pair = Pair(SHAPES["capsule"], SHAPES["capsule"])
+    generator = rng(6)
+    t = np.linspace(-0.15, 0.15, 601)
+    for _ in range(20):
+        X_A, X_B = (random_pose(generator, 0.3) for _ in range(2))
+        points_A, points_B = (
+            X.translation() + t[:, None] * X.rotation().matrix()[:, 2] for X in (X_A, X_B)
+        )
+        between = np.linalg.norm(points_A[:, None] - points_B[None], axis=2).min()
+        # The grid of 0.5 mm is coarser than the closest points by less than this.
+        expected = between - 0.1
+        assert expected - 1e-3 * 0.5 <= pair.distance(X_A, X_B)[0] <= expected + 1e-6
+
+
+def test_distances_of_a_cylinder_over_a_box_equal_their_closed_form() -> None:
+    pair = Pair(SHAPES["cylinder"], SHAPES["box"])
+    box = RigidTransform()
+    upright = RigidTransform([0.1, 0.02, 0.05 + 0.1 + 0.013])
+    assert pair.distance(upright, box)[0] == pytest.approx(0.013, abs=1e-6)
+    lying = RigidTransform(RollPitchYaw(math.pi / 2, 0.0, 0.3), [0.0, 0.0, 0.05 + 0.06 + 0.002])
+    assert pair.distance(lying, box)[0] == pytest.approx(0.002, abs=1e-6)
+    beside = RigidTransform([0.15 + 0.06 + 0.04, 0.0, 0.0])
+    assert pair.distance(beside, box) == pytest.approx((0.04, 1.0), abs=1e-4)
+    corner = RigidTransform([0.15 + 0.3, 0.1 + 0.4, 0.0])
+    assert pair.distance(corner, box)[0] == pytest.approx(0.5 - 0.06, abs=1e-6)
+    touching = RigidTransform([0.0, 0.0, 0.05 + 0.1 - 0.001])
+    assert math.isnan(pair.distance(touching, box)[0])
+
+
+def test_shapes_without_a_core_are_left_to_drake() -> None:
+    pair = Pair(Ellipsoid(0.1, 0.2, 0.3), SHAPES["box"])
+    assert math.isnan(pair.distance(RigidTransform([5.0, 0.0, 0.0]), RigidTransform())[0])
+
+
+def test_penetration_of_a_held_object_is_drakes() -> None:
+    """A box that sinks 0.4 mm into the floor, and one that stands beside it."""
+    cell = cell_with()
+    box, beside = resting("sugar_box"), resting("tomato_soup_can", xy=(0.2, 0.2))
+    model = CollisionModel(cell, [(o.name, o.object_class) for o in (box, beside)])
+    model.set_object_poses([box, beside])
+    tool = next(iter(cell.gripper.tools))
+    q = np.array(cell.robot.home)
+    robot = load_robot(cell.robot)
+    X_TF = robot.X_TB @ RigidTransform(robot.forward_kinematics(q))
+    X_TG = X_TF @ cell.gripper.tools[tool].X_FG
+    X_TO = rigid_transform(box.X_TO.translated((0.1, 0.0, -0.0004)))
+    model.attach_object(box.name, tool, X_TO.inverse() @ X_TG)
+    found = {d.pair: d.distance for d in model.distances_below(q, 0.05)}
+    assert found[box.name, "floor"] == pytest.approx(-0.0004, abs=1e-9)
+    model.detach_object()
+    assert (box.name, "floor") not in {d.pair for d in model.distances_below(q, 0.05)}
