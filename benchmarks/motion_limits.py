@@ -7,10 +7,10 @@ with trajectory optimization; each of these plans counts.
 """
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -20,7 +20,8 @@ from scipy.interpolate import make_interp_spline
 
 from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.gripper import Payload
-from drake_clutter.cell.suction import SuctionGripper, payload_wrench
+from drake_clutter.cell.payload_limits import payload_wrench
+from drake_clutter.cell.suction import SuctionGripper
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import write_json
@@ -57,6 +58,42 @@ MAX_EXCESS = 0.01
 """Largest fraction by which a limit may be exceeded."""
 _NUM_PATH_POINTS = 200
 """Points of a motion through which its path is interpolated."""
+
+
+@dataclass(frozen=True)
+class PlanRecord:
+    """What was measured of a plan.
+
+    Attributes:
+        ratios: Largest ratio to each limit, by name; see `limit_ratios`.
+        duration: Duration [s].
+        time_optimal_duration: Shortest duration along the paths without a limit of jerk [s].
+        min_distance: Smallest distance to obstacles [m].
+    """
+
+    ratios: dict[str, float]
+    duration: float
+    time_optimal_duration: float
+    min_distance: float
+
+
+@dataclass(frozen=True)
+class MoveRecord:
+    """Record of a move.
+
+    Attributes:
+        robot: Robot of the cell.
+        failed_moves: Number of random moves before it that could not be planned.
+        infeasible: Limits that kept any of these from being planned.
+        unoptimized: Plan without trajectory optimization.
+        optimized: Plan with trajectory optimization; None if there is none.
+    """
+
+    robot: str
+    failed_moves: int
+    infeasible: tuple[str, ...]
+    unoptimized: PlanRecord
+    optimized: PlanRecord | None
 
 
 def cell_of(robot: str) -> WorkCell:
@@ -143,21 +180,21 @@ def time_optimal_duration(cell: WorkCell, plan: PickPlacePlan, segment: Trajecto
     return float((2 * np.diff(problem.grid) / (speeds[1:] + speeds[:-1])).sum())
 
 
-def check_plan(cell: WorkCell, plan: PickPlacePlan) -> Row:
+def check_plan(cell: WorkCell, plan: PickPlacePlan) -> PlanRecord:
     """Return what was measured of a plan."""
     ratios = [limit_ratios(cell, plan, segment) for segment in plan.segments]
     names = {name for of_segment in ratios for name in of_segment}
-    return {
-        "ratios": {
+    return PlanRecord(
+        ratios={
             name: float(f"{max(part.get(name, 0.0) for part in ratios):.5g}")
             for name in sorted(names)
         },
-        "duration": round(plan.duration, 4),
-        "time_optimal_duration": round(
+        duration=round(plan.duration, 4),
+        time_optimal_duration=round(
             sum(time_optimal_duration(cell, plan, segment) for segment in plan.segments), 4
         ),
-        "min_distance": round(min(s.min_distance.distance for s in plan.segments), 6),
-    }
+        min_distance=round(min(s.min_distance.distance for s in plan.segments), 6),
+    )
 
 
 class MovePlanner:
@@ -199,7 +236,7 @@ class MovePlanner:
         height = picked.X_TO.translation[2] - picked.bounds_T[0][2] + 0.001
         return scene, picked, Pose.from_rotation(R, (x, y, height))
 
-    def __call__(self, number: int) -> dict[str, Any]:
+    def __call__(self, number: int) -> MoveRecord:
         """Return the record of a number: the first of its random moves that can be planned."""
         robot = ROBOTS[number % len(ROBOTS)]
         cell = cell_of(robot)
@@ -213,20 +250,19 @@ class MovePlanner:
                 break
             failures.append(unoptimized)
         optimized = self.planner(robot, True).plan(*arguments)
-        infeasible = [
-            failure.detail
-            for failure in failures
-            if failure.reason is PlanningFailureReason.TRAJECTORY_INFEASIBLE
-        ]
-        return {
-            "robot": robot,
-            "failed_moves": len(failures),
-            "infeasible": infeasible,
-            "unoptimized": check_plan(cell, unoptimized),
-            "optimized": check_plan(cell, optimized)
-            if isinstance(optimized, PickPlacePlan)
-            else None,
-        }
+        return MoveRecord(
+            robot=robot,
+            failed_moves=len(failures),
+            infeasible=tuple(
+                failure.detail
+                for failure in failures
+                if failure.reason is PlanningFailureReason.TRAJECTORY_INFEASIBLE
+            ),
+            unoptimized=check_plan(cell, unoptimized),
+            optimized=(
+                check_plan(cell, optimized) if isinstance(optimized, PickPlacePlan) else None
+            ),
+        )
 
 
 def summarize(records: list[Row]) -> list[Row]:
@@ -275,6 +311,7 @@ def main(
         header,
         partial(MovePlanner, seed),
         range(math.ceil(count / 2)),
+        schema=MoveRecord,
         workers=workers,
     )
     rows = summarize(records)
