@@ -411,7 +411,7 @@ def load_catalog(folder: Path | None = None) -> Catalog:
     shipped = resource_path("sdf_assets")
     folders: tuple[Path, ...] = (shipped,)
     if folder is not None:
-        with reading_file(folder, "an asset folder"):
+        with reading_file(str(folder), "an asset folder"):
             own_folder = folder.resolve()
         folders = tuple(dict.fromkeys((shipped, own_folder)))
     classes: dict[str, ObjectClass] = {}

@@ -37,6 +37,14 @@ _STORAGE_ERRORS = frozenset(
 _TEMPORARY_NAME = re.compile(r"\.(?P<stem>.+)\.tmp-[0-9a-f]{8}(?P<suffix>(\.[^.]*)?)")
 """Name of a `temporary_path`."""
 
+MAX_FILE_SIZE = 4 * 2**30
+"""Largest size of a file that is read [bytes].
+
+The largest ones are states of trainings, with replay buffers.
+"""
+MAX_TEXT_SIZE = 2**28
+"""Largest size of a text file that is read [bytes]. Its document takes about ten times as much."""
+
 MAX_ERROR_LENGTH = 500
 """Largest number of characters of a whole error message; more than a terminal shows at a glance."""
 
@@ -68,13 +76,16 @@ def reading_file(source: str | Path, allowed_content: str) -> Iterator[None]:
     are missing, cut off or damaged, and content that the libraries of their formats refuse.
 
     Args:
-        source: The file.
+        source: The file, or where else the content comes from. A path is that of a file, which is
+            checked: to read a pipe could take forever, and a huge file all memory.
         allowed_content: What the file may contain, for the message.
 
     Raises:
-        InputError: The block raised an exception.
+        InputError: The file is none or too large, or the block raised an exception.
     """
     try:
+        if isinstance(source, Path):
+            _check_file(source)
         yield
     except InputError as error:
         if str(source) in str(error):
@@ -87,6 +98,24 @@ def reading_file(source: str | Path, allowed_content: str) -> Iterator[None]:
         raise input_error(
             str(source), f"cannot be read ({reason}); expected {allowed_content}"
         ) from error
+
+
+def _check_file(path: Path) -> None:
+    """Check that a path is that of a file that is not too large.
+
+    Raises:
+        ValueError: It is not.
+        OSError: There is no such file.
+    """
+    status = path.stat()
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    if not stat.S_ISREG(status.st_mode):
+        raise ValueError("is not a regular file")
+    if status.st_size > MAX_FILE_SIZE:
+        raise ValueError(
+            f"has {status.st_size / 2**30:.1f} GiB, more than {MAX_FILE_SIZE / 2**30:g} GiB"
+        )
 
 
 def _describe_error(error: Exception) -> str:
@@ -110,9 +139,11 @@ def read_text(path: Path, allowed_content: str) -> str:
         allowed_content: What the file may contain, for the message.
 
     Raises:
-        InputError: The file cannot be read or is not UTF-8.
+        InputError: The file cannot be read, is larger than `MAX_TEXT_SIZE`, or is not UTF-8.
     """
     with reading_file(path, allowed_content):
+        if path.stat().st_size > MAX_TEXT_SIZE:
+            raise ValueError(f"is larger than {MAX_TEXT_SIZE / 2**20:g} MiB")
         return path.read_text(encoding="utf-8")
 
 
@@ -295,4 +326,5 @@ def private_temporary_folder(purpose: str) -> Path:
 
 def file_sha256(path: Path) -> str:
     """Return the SHA-256 hash of a file as hexadecimal digits."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

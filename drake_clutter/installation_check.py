@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 _PROBE_TIMEOUT = 120.0
 """Time limit of a probe; the first rendering on a machine compiles shaders [s]."""
@@ -27,12 +28,14 @@ class Check:
         ok: Whether the component is present and works.
         detail: What was found.
         remedy: How to install what is missing; empty if `ok`.
+        required: Whether the package cannot do without; False for an extra that is not installed.
     """
 
     name: str
     ok: bool
     detail: str
     remedy: str = ""
+    required: bool = True
 
 
 class ProbeError(RuntimeError):
@@ -48,14 +51,20 @@ def run_checks() -> list[Check]:
         ),
         _run_probe(probe_compilation, "set NUMBA_CACHE_DIR to a folder that can be written"),
         _run_probe(probe_solvers, "install Drake's own wheel: pip install --force-reinstall drake"),
-        _run_probe(
-            probe_torch, "needed by the trained policies: pip install 'drake-clutter[learned]'"
-        ),
+        _check_torch(),
         _run_probe(
             probe_assets, "reinstall drake-clutter; in a checkout: drake-clutter assets build"
         ),
         _run_probe(probe_machine, f"use fewer workers; one may need {_MIN_MEMORY:g} GiB"),
     ]
+
+
+def _check_torch() -> Check:
+    """Check PyTorch, which belongs to an extra."""
+    remedy = "needed by the trained policies: pip install 'drake-clutter[learned]'"
+    if find_spec("torch") is None:
+        return Check("torch", False, "not installed", remedy, required=False)
+    return _run_probe(probe_torch, remedy)
 
 
 def probe_drake() -> str:

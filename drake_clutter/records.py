@@ -14,7 +14,14 @@ from io import FileIO
 from pathlib import Path
 from typing import Any
 
-from drake_clutter.files import InputError, atomic_write, input_error, parse_json, reading_file
+from drake_clutter.files import (
+    MAX_TEXT_SIZE,
+    InputError,
+    atomic_write,
+    input_error,
+    parse_json,
+    reading_file,
+)
 from drake_clutter.outputs import output_file
 from drake_clutter.resources import git_commit
 from drake_clutter.validation import validate
@@ -103,13 +110,13 @@ def resume_jsonl(
     """
     header = json.loads(json.dumps(header))
     with _open_journal(path) as journal:
-        with reading_file(path, _CONTENT):
+        with reading_file(str(path), _CONTENT):
             text = journal.readall().decode()
         lines, compressed = _complete_lines(text), _compressed_lines(path)
         if len(lines) < len(compressed) or not lines:
             lines = compressed or [json.dumps({**header, "commit": git_commit()}) + "\n"]
         written_header, *records = _parse_lines(lines, path, schema)
-        with reading_file(path, _CONTENT):
+        with reading_file(str(path), _CONTENT):
             upgraded = upgrade_header(written_header)
         if text != "".join(lines):
             journal.truncate(0)
@@ -143,7 +150,11 @@ def _compressed_lines(path: Path) -> list[str]:
     if path.suffix != ".gz" or not path.exists():
         return []
     with reading_file(path, _CONTENT):
-        return gzip.decompress(path.read_bytes()).decode().splitlines(keepends=True)
+        with gzip.open(path) as file:
+            content = file.read(MAX_TEXT_SIZE + 1)
+        if len(content) > MAX_TEXT_SIZE:
+            raise ValueError(f"holds more than {MAX_TEXT_SIZE / 2**20:g} MiB")
+        return content.decode().splitlines(keepends=True)
 
 
 def _parse_lines(lines: Iterable[str], path: Path, schema: Any) -> list[Any]:

@@ -164,11 +164,7 @@ def with_current_names(schema: type, document: Any) -> Any:
         schema: Class of the document; classes of its fields are not considered.
         document: The document.
     """
-    current_names = {
-        earlier: name
-        for base in reversed(schema.__mro__)
-        for earlier, name in _RENAMED.get(base, {}).items()
-    }
+    current_names = _current_names(schema)
     if not current_names or not isinstance(document, dict):
         return document
     return {
@@ -176,6 +172,15 @@ def with_current_names(schema: type, document: Any) -> Any:
         if key in current_names and current_names[key] not in document
         else key: value
         for key, value in document.items()
+    }
+
+
+def _current_names(schema: type) -> dict[str, str]:
+    """Return the current names of the renamed fields of a schema by the earlier ones."""
+    return {
+        earlier: name
+        for base in reversed(schema.__mro__)
+        for earlier, name in _RENAMED.get(base, {}).items()
     }
 
 
@@ -353,17 +358,45 @@ def load_config_as(
         upgrade: Converts a document of an earlier version.
 
     Raises:
-        InputError: The file cannot be read, or a field is unknown or has a value that is not
-            allowed.
+        InputError: The file cannot be read, or a field is unknown, has a value that is not
+            allowed, or is set under an earlier name and the current one.
     """
     config = defaults
     if path is not None:
         document = read_yaml(path, "a mapping of config fields")
         config = override_config(config, upgrade({} if document is None else document), str(path))
+    names: dict[str, Any] = {}
+    for setting in settings:
+        part = names
+        for name in setting.partition("=")[0].split("."):
+            part = part.setdefault(name, {})
+    _check_names(config, names)
     for setting in settings:
         document = _parse_setting(setting, config)
         config = override_config(config, upgrade(document), f"--set {setting}")
     return config
+
+
+def _check_names(config: Any, names: Mapping[str, Any]) -> None:
+    """Check that no field is set under two names.
+
+    Args:
+        config: The config, or a part of it.
+        names: Names of the fields that are set, as nested mappings.
+
+    Raises:
+        InputError: A field is set under an earlier name and the current one.
+    """
+    current_names = _current_names(type(config))
+    for earlier in names.keys() & current_names.keys():
+        if current_names[earlier] in names:
+            raise input_error(
+                "--set",
+                f"{earlier} is the earlier name of {current_names[earlier]}; expected one of them",
+            )
+    fields = config if isinstance(config, dict) else _field_values(config)
+    for name, below in names.items():
+        _check_names(fields.get(current_names.get(name, name)), below)
 
 
 def _parse_setting(setting: str, config: Any) -> Any:

@@ -11,6 +11,10 @@ import yaml
 
 from drake_clutter.files import format_value, input_error, read_text
 
+MAX_DEPTH = 100
+"""Largest depth of nested mappings and lists; libyaml overflows the stack at some ten thousand."""
+MAX_VALUES = 10**7
+"""Largest number of values of a document, with those of its aliases."""
 _EXPONENT_NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$")
 """Numbers such as 1e-3, which YAML 1.1 reads as strings."""
 
@@ -85,6 +89,7 @@ def parse_yaml(text: str, source: str, allowed_content: str = "YAML") -> Any:
         InputError: The text is not YAML, or a mapping has a duplicate key.
     """
     try:
+        _check_size(text)
         return yaml.load(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
@@ -92,3 +97,31 @@ def parse_yaml(text: str, source: str, allowed_content: str = "YAML") -> Any:
         raise input_error(source, f"is not YAML ({reason}); expected {allowed_content}") from error
     except Exception as error:  # many types, for a bad date, number or nesting
         raise input_error(source, f"is not YAML ({error}); expected {allowed_content}") from error
+
+
+def _check_size(text: str) -> None:
+    """Check depth and number of values of a YAML text, before its document is built.
+
+    Raises:
+        ValueError: There are more than `MAX_DEPTH` or `MAX_VALUES`.
+    """
+    sizes = [0]  # of the containers that are open, and their anchors
+    anchors: list[str | None] = []
+    known: dict[str, int] = {}
+    for event in yaml.parse(text, Loader=yaml.CSafeLoader):
+        if isinstance(event, yaml.CollectionStartEvent):
+            sizes.append(1)
+            anchors.append(event.anchor)
+        elif isinstance(event, yaml.CollectionEndEvent):
+            size = sizes.pop()
+            sizes[-1] += size
+            if anchor := anchors.pop():
+                known[anchor] = size
+        elif isinstance(event, yaml.AliasEvent):
+            sizes[-1] += known.get(event.anchor, 1)
+        elif isinstance(event, yaml.ScalarEvent):
+            sizes[-1] += 1
+        if len(sizes) > MAX_DEPTH:
+            raise ValueError(f"more than {MAX_DEPTH} mappings and lists are nested")
+        if sizes[-1] > MAX_VALUES:
+            raise ValueError(f"more than {MAX_VALUES:.0e} values")

@@ -34,9 +34,7 @@ def main(agent: str, fidelity: str, index: int, max_moves: int) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--agent", default="largest-clear", help="student, largest-clear, ...")
-    parser.add_argument(
-        "--fidelity", default="settle", help="static, static_or_drake, settle or arm"
-    )
+    parser.add_argument("--fidelity", default="settle", help="static_or_drake, settle or arm")
     parser.add_argument("--scene", type=int, default=0, help="index in the scene dataset")
     parser.add_argument("--max-moves", type=int, default=10)
     arguments = parser.parse_args()

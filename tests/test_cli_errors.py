@@ -12,7 +12,9 @@ from pathlib import Path
 
 import pytest
 from conftest import DEFAULT_CELL, resting, scene_of
+from typer.testing import CliRunner
 
+from drake_clutter.cli import app
 from drake_clutter.files import atomic_write, cli_error_handler
 from drake_clutter.grammar import Orientation
 from drake_clutter.learning.checkpoint import load_tensors, save_tensors
@@ -153,3 +155,17 @@ def test_tensors_that_cannot_be_written_are_a_file_error(tmp_path: Path) -> None
     tensors, state = load_tensors(path)
     assert json.dumps(state) == '{"step": 1}'
     assert tensors["a"].tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "choices"),
+    [
+        (["explore", "scene.yaml", "--fidelity", "x"], "'static_or_drake', 'settle', 'arm'"),
+        (["export", "scene.yaml", "--format", "x"], "'dmd', 'sdf', 'mjcf', 'glb'"),
+    ],
+)
+def test_a_wrong_choice_names_the_choices(arguments: list[str], choices: str) -> None:
+    result = CliRunner().invoke(app, [*arguments, "--out", "out"])
+    message = " ".join(result.stderr.replace("\u2502", "").split())
+    assert f"{arguments[2]}': 'x' is not one of {choices}." in message
+    assert result.exit_code == 2

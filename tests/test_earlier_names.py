@@ -18,6 +18,7 @@ from drake_clutter.agents.learned_generator import load_rule_network
 from drake_clutter.agents.ppo import PPOConfig
 from drake_clutter.agents.replay_buffer import RENAMED_ARRAYS as RENAMED_REPLAY_ARRAYS
 from drake_clutter.agents.soft_q import RENAMED_STATE, SoftQConfig, SoftQLearner
+from drake_clutter.config import load_config
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import load_checkpoint, load_tensors, save_tensors
 from drake_clutter.learning.training_run import CONFIG_FILE, TrainingRun
@@ -200,3 +201,13 @@ def test_a_run_folder_of_version_0_1_is_taken_up(tmp_path: Path) -> None:
     assert path.read_text().count("most_objects") == 1, "the folder is left as it was"
     with pytest.raises(InputError, match="another config"):
         start(replace(ExplorerTrainingConfig(), max_objects=10))
+
+
+def test_a_field_is_not_set_under_two_names() -> None:
+    settings = ["settle.rest_drift=0.001", "settle.max_rest_displacement=0.002"]
+    for order in (settings, settings[::-1]):
+        with pytest.raises(InputError) as refused:
+            load_config(settings=order)
+        message = "rest_drift is the earlier name of max_rest_displacement; expected one of them"
+        assert str(refused.value) == f"--set: {message}"
+    assert load_config(settings=settings[:1]).settle.max_rest_displacement == 0.001

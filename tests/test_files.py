@@ -1,15 +1,19 @@
 """Atomic writing of files."""
 
 import json
+import os
 from pathlib import Path
 
 import pytest
 
 from drake_clutter.files import (
+    InputError,
     atomic_write,
+    read_text,
     write_json,
     write_text,
 )
+from drake_clutter.yaml_io import parse_yaml
 
 
 def test_write_text_and_json(tmp_path: Path) -> None:
@@ -63,3 +67,47 @@ def test_two_writers_use_different_temporary_files(tmp_path: Path) -> None:
         first.write_text("first")
         second.write_text("second")
     assert path.read_text() == "first"  # the outer block ends last
+
+
+def test_only_files_of_bounded_size_are_read(tmp_path: Path) -> None:
+    """A pipe would be waited for, and zeros of a sparse file would fill the memory."""
+    pipe, huge, large = tmp_path / "pipe", tmp_path / "huge", tmp_path / "large"
+    os.mkfifo(pipe)
+    for path, size in ((huge, 10 * 2**30), (large, 2**28 + 1)):
+        with path.open("wb") as file:
+            file.truncate(size)
+    problems = {
+        pipe: "is not a regular file",
+        huge: "has 10.0 GiB, more than 4 GiB",
+        large: "is larger than 256 MiB",
+        tmp_path: "Is a directory",
+        tmp_path / "none": "No such file or directory",
+    }
+    for path, problem in problems.items():
+        with pytest.raises(InputError) as refused:
+            read_text(path, "a text")
+        assert str(refused.value) == f"{path}: cannot be read ({problem}); expected a text"
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("[" * 10**5 + "]" * 10**5, "more than 100 mappings and lists are nested"),
+        ("- " * 10**5 + "1", "more than 100 mappings and lists are nested"),
+        ("{a: " * 10**5 + "1" + "}" * 10**5, "more than 100 mappings and lists are nested"),
+        (
+            "a0: &a0 [x]\n"
+            + "".join(f"a{k + 1}: &a{k + 1} [{f'*a{k}, ' * 10}]\n" for k in range(9)),
+            "more than 1e+07 values",
+        ),
+    ],
+)
+def test_deep_and_exponential_yaml_is_refused(text: str, problem: str) -> None:
+    with pytest.raises(InputError) as refused:
+        parse_yaml(text, "scene.yaml")
+    assert str(refused.value) == f"scene.yaml: is not YAML ({problem}); expected YAML"
+
+
+def test_nested_yaml_with_anchors_is_read() -> None:
+    nested = "[" * 99 + "]" * 99
+    assert str(parse_yaml(f"{{a: &x [1, 2], b: *x, c: {nested[1:-1]}}}", "f")["b"]) == "[1, 2]"

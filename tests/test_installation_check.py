@@ -1,11 +1,14 @@
 """Checks of the installation: a broken component is reported with a remedy."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from typer.testing import CliRunner
 
 from drake_clutter import installation_check
+from drake_clutter.cli import app
 from drake_clutter.installation_check import Check
 
 
@@ -23,6 +26,19 @@ def test_all_checks_pass() -> None:
     assert [check for check in found.values() if not check.ok] == []
     assert all(check.detail and not check.remedy for check in found.values())
     assert "SNOPT" in found["solvers"].detail
+
+
+def test_an_extra_that_is_not_installed_is_no_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(installation_check, "find_spec", lambda name: None)
+    missing = installation_check._check_torch()
+    assert (missing.ok, missing.required, missing.detail) == (False, False, "not installed")
+    monkeypatch.setattr(installation_check, "run_checks", lambda: [missing])
+    result = CliRunner().invoke(app, ["doctor"])
+    assert result.exit_code == 0
+    assert "optional" in result.stdout
+    broken = replace(missing, required=True)
+    monkeypatch.setattr(installation_check, "run_checks", lambda: [broken])
+    assert CliRunner().invoke(app, ["doctor"]).exit_code == 1
 
 
 def test_a_broken_library_is_reported(torch_module: Path) -> None:

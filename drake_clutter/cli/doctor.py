@@ -12,7 +12,7 @@ from drake_clutter.cli.output import escape_markup, out_console, print_json
 def doctor(as_json: JsonOption = False) -> None:
     """Check the installation and report missing components.
 
-    Exits with code 1 if a check fails.
+    Exits with code 1 if a check fails. An extra that is not installed is no failure.
     """
     from drake_clutter.installation_check import run_checks
 
@@ -22,10 +22,11 @@ def doctor(as_json: JsonOption = False) -> None:
     else:
         table = Table("", "check", "found", "remedy")
         for check in checks:
-            status = "[green]ok" if check.ok else "[red]failed"
+            failure = "[red]failed" if check.required else "[yellow]optional"
+            status = "[green]ok" if check.ok else failure
             table.add_row(
                 status, check.name, escape_markup(check.detail), escape_markup(check.remedy)
             )
         out_console.print(table)
-    if not all(check.ok for check in checks):
+    if not all(check.ok for check in checks if check.required):
         raise typer.Exit(1)

@@ -89,7 +89,8 @@ ExplorerOption = Annotated[
     typer.Option(
         "--agent",
         help="Exploration policy: random, largest-first or largest-clear (rules); student, "
-        "student-dagger, student-14, student-rg or teacher (trained); or a checkpoint file.",
+        "student-dagger, student-14, student-rg or teacher (trained); full-knowledge (optimal "
+        "plans from the true state); or a checkpoint file.",
     ),
 ]
 WorkersOption = Annotated[

@@ -4,6 +4,7 @@ import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
+from typer import BadParameter
 from typer.core import TyperCommand
 
 RENAMED_OPTIONS: Mapping[str, str] = {
@@ -16,6 +17,9 @@ RENAMED_OPTIONS: Mapping[str, str] = {
 RENAMED_VALUES: Mapping[str, Mapping[str, str]] = {"--fidelity": {"fast": "static_or_drake"}}
 """Current value by its earlier spelling, of each option."""
 
+_PYDANTIC_PREFIX = "Value error, "
+"""What pydantic writes before the message of a validator, and Typer 0.29 passes on."""
+
 
 class RenamingCommand(TyperCommand):
     """A command that accepts earlier spellings, which its help does not show."""
@@ -23,7 +27,11 @@ class RenamingCommand(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments after the replacement of earlier spellings."""
         options = {name for parameter in self.params for name in parameter.opts}
-        return super().parse_args(ctx, list(with_current_spellings(options, args)))
+        try:
+            return super().parse_args(ctx, list(with_current_spellings(options, args)))
+        except BadParameter as error:
+            error.message = error.message.removeprefix(_PYDANTIC_PREFIX)
+            raise
 
 
 def with_current_spellings(options: Collection[str], args: Iterable[str]) -> Iterator[str]:

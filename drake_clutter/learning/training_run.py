@@ -164,7 +164,9 @@ class TrainingRun:
         ):
             for name, value in values.items():
                 self._writer.add_scalar(f"{group}/{name}", value, step)
-        minutes_left = (self._total_steps - step) / rate / 60 if rate else float("nan")
+        # The last iteration may pass the number of steps.
+        remaining_steps = max(0, self._total_steps - step)
+        minutes_left = remaining_steps / rate / 60 if rate else float("nan")
         metrics = ", ".join(f"{name} {value:.3g}" for name, value in {**charts, **losses}.items())
         self._console.print(
             f"{step:>7} of {self._total_steps}: {metrics}; {rate:.0f} steps/s, "

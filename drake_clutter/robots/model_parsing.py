@@ -11,7 +11,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
 from drake_clutter.cell.sdf_text import mesh_uri
-from drake_clutter.files import InputError
+from drake_clutter.files import InputError, read_text
 from drake_clutter.resources import resource_path
 from drake_clutter.robots.stl_conversion import convert_stl_to_obj
 
@@ -92,13 +92,13 @@ def _read_xml(path: Path) -> ElementTree.Element:
     """Return the root element of a model file, or raise an `InputError`."""
     # Without registration, ElementTree would rename the prefix, which Drake would not recognize.
     ElementTree.register_namespace("drake", _DRAKE)
+    text = read_text(path, "an SDF or URDF")
     try:
-        text = path.read_text(encoding="utf-8")
         # Many URDF files use the prefix without declaring it, which Drake accepts.
         if "drake:" in text and _DRAKE not in text:
             text = re.sub(r"<(robot|sdf)\b", rf'<\1 xmlns:drake="{_DRAKE}"', text, count=1)
         return ElementTree.fromstring(text)
-    except (OSError, ValueError, ElementTree.ParseError) as error:
+    except (ValueError, ElementTree.ParseError) as error:
         raise InputError(f"{path}: is not XML ({error}); expected an SDF or URDF") from error
 
 
