@@ -95,3 +95,12 @@ def test_a_part_of_version_0_1_is_read(tmp_path: Path) -> None:
         "pose_errors": [],
         "targets": [{"num_solutions": 2, "blocking_bodies": "table"}],
     }
+
+
+def test_images_of_version_0_1_are_extended(tmp_path: Path) -> None:
+    earlier = {"objects": "ycb7", "dropped_share": 0.3, "seed": 0, "agents": ["random"]}
+    (tmp_path / JOB_FILE).write_text(json.dumps(earlier))
+    (tmp_path / "camera.json").touch()
+    images = {"objects": "ycb7", "catalog": None, "heap_fraction": 0.3, "seed": 0}
+    with open_job_folder(tmp_path, images | {"agents": ["random"]}):
+        assert json.loads((tmp_path / JOB_FILE).read_text()) == earlier
