@@ -105,3 +105,11 @@ def test_plans_avoid_occluded_boxes() -> None:
     blocked = planner.plan([LOWER], LOWER.name, place, (there,))
     assert isinstance(blocked, PlanningFailure)
     assert blocked.reason is PlanningFailureReason.IN_COLLISION
+
+
+def test_points_on_a_line_are_no_object() -> None:
+    """A row of pixels spans no area; eight rows do."""
+    for width, count in ((1, 0), (8, 1)):
+        depth = EMPTY.copy()
+        depth[200 : 200 + width, 260:340] -= 0.05
+        assert len(occluded_boxes([], replace(seen([]), depth=depth), EMPTY)) == count

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from conftest import DEFAULT_CELL, TRAY, resting, scene_of
 
 from drake_clutter.catalog import load_catalog
@@ -173,3 +174,19 @@ def test_an_object_out_of_view_that_penetrates_a_detection_is_lost() -> None:
     )
     assert len(observation.detections) == 2
     assert lost == ("gelatin_box_1",)
+
+
+@pytest.mark.parametrize(("fraction", "is_kept"), [(0.4, True), (0.6, False)])
+def test_a_larger_known_object_replaces_a_detection_of_which_it_explains_half(
+    fraction: float, is_kept: bool
+) -> None:
+    known, observed, across = side_by_side()
+    inside = np.flatnonzero(observed.detections[0].mask)
+    outside = np.flatnonzero(~np.any([d.mask for d in observed.detections], axis=0))
+    count = round(1000 * fraction)
+    mask = np.zeros(observed.depth.shape, bool)
+    mask.ravel()[[*inside[:count], *outside[: 1000 - count]]] = True
+    detection = replace(across.detections[0], mask=mask)
+    observation, _ = associate_detections(known[:1], replace(across, detections=(detection,)))
+    assert (detection.X_TO in {d.X_TO for d in observation.detections}) == is_kept
+    assert known[0].X_TO in {d.X_TO for d in observation.detections}
