@@ -70,11 +70,14 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
 """Files of the modules that decide results, below `drake_clutter`, by group."""
 TESTS = (
     "nnls",
+    "equilibrium",
+    "contacts",
     "static_judge",
     "static_judge_columns",
     "static_executor",
     "settle",
     "settle_executor",
+    "drop",
     "placement",
     "layout",
     "geometry",
@@ -110,6 +113,8 @@ TESTS = (
 """Test files that reach these modules in their own process."""
 TESTS_OF_COMPILED_CODE = (
     "nnls",
+    "equilibrium",
+    "contacts",
     "static_judge",
     "static_judge_columns",
     "static_executor",
@@ -280,15 +285,18 @@ class TestCoverage:
     def tests(self, mutant: Mutant) -> tuple[list[str], int]:
         """Return the tests of a mutant in the order of execution.
 
+        Of code that runs on import, all tests of the module may show the result.
+
         Returns:
             The tests, and how many of them execute the changed statement.
         """
         first, last = mutant.statement
+        at_import = self.runs_at_import(mutant)
         executing = list[str]()
         others = list[str]()
         for test, lines in self.lines.get(mutant.path, {}).items():
             if test:
-                executes = any(first <= line <= last for line in lines)
+                executes = at_import or any(first <= line <= last for line in lines)
                 (executing if executes else others).append(test)
         total = 0.0
         chosen = list[str]()

@@ -234,6 +234,10 @@ class TestRun:
         worst = max(before, report.outcome, key=("passed", "skipped", "failed").index)
         self._outcomes[report.nodeid] = worst, 0.0
 
+    def has_tests(self) -> bool:
+        """Return whether there are tests to run."""
+        return self._limits != {}
+
     def has_failed(self) -> bool:
         """Return whether a test has failed."""
         return any(outcome == "failed" for outcome, _ in self._outcomes.values())
@@ -245,11 +249,8 @@ def run_fresh(job: Job) -> Result:
         sys.meta_path.insert(0, MutatedModule(job["path"], job["source"]))
     run = TestRun(job)
     exit_code = pytest.main([*OPTIONS, *job["files"]], plugins=[run])
-    if job["limits"] == {}:
-        return run.result()
-    if exit_code not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
-        return {"failure": "the tests cannot be collected"}
-    return run.result()
+    is_collected = exit_code == pytest.ExitCode.OK or run.has_failed() or not run.has_tests()
+    return run.result() if is_collected else {"failure": "the tests cannot be collected"}
 
 
 class Collection:

@@ -92,11 +92,13 @@ def test_the_tests_of_the_line_come_first_and_the_fastest_of_them_first(tmp_path
     (tmp_path / "test_module.json").write_text(
         json.dumps({"outcomes": outcomes, "lines": {"module.py": lines}})
     )
+    covered = TestCoverage.read(tmp_path)
+    assert covered.tests(mutant) == (["fast", "slow", "beside"], 2)
     (tmp_path / "imports.json").write_text(
         json.dumps({"outcomes": {}, "lines": {"module.py": {"": [first]}}})
     )
     covered = TestCoverage.read(tmp_path)
-    assert covered.tests(mutant) == (["fast", "slow", "beside"], 2)
+    assert covered.tests(mutant) == (["beside", "fast", "slow"], 3)
     assert covered.runs_at_import(mutant)
     assert not covered.runs_at_import(find_mutants("module.py", SOURCE)[0])
 
