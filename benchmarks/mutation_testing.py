@@ -12,6 +12,7 @@ Modules with compiled functions are tested without the compiler: the tracer does
 code, and compiling every mutant takes longer than interpreting small cases.
 """
 
+import hashlib
 import json
 import os
 import subprocess
@@ -363,6 +364,12 @@ def mutant_job(mutant: Mutant, covered: TestCoverage) -> Job:
     }
 
 
+def git_blob(path: Path) -> str:
+    """Return the abbreviated name of a file's content in Git, as `git hash-object` does."""
+    content = path.read_bytes()
+    return hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()[:12]
+
+
 def mutant_row(mutant: Mutant, result: Result, num_executing: int) -> Row:
     """Return the row of a mutant in the results file."""
     text = (ROOT / mutant.path).read_text(encoding="utf-8").splitlines()[mutant.line - 1]
@@ -383,6 +390,7 @@ def mutant_row(mutant: Mutant, result: Result, num_executing: int) -> Row:
         "caught_by": caught_by,
         "tests": len(outcomes),
         "tests_of_the_line": num_executing,
+        "blob": git_blob(ROOT / mutant.path),
     }
 
 
