@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from drake_clutter.grammar import Orientation
 from drake_clutter.scenes.scene import SceneObject
-from drake_clutter.stability import contacts
+from drake_clutter.stability import contacts, shape_table
 from drake_clutter.stability.contacts import GROUND, MAX_MISS_DISTANCE
 from drake_clutter.stability.shape_table import ShapeTable
 
@@ -208,3 +208,14 @@ def test_objects_that_are_known_to_be_apart_do_not_overlap() -> None:
     assert sorted(pair) == [0, 1]
     is_apart[:] = True
     assert contacts.find_contacts(*arguments)[0] == contacts.NO_FAULT
+
+
+def test_shapes_keep_their_rows_until_the_table_is_full(monkeypatch: pytest.MonkeyPatch) -> None:
+    shapes = ShapeTable()
+    box, can = resting("cracker_box"), resting("tomato_soup_can")
+    first, second = shapes.find_rows([box, can]).tolist()
+    assert shapes.find_rows([can, box, can]).tolist() == [second, first, second]
+    assert shapes.generation == 0
+    monkeypatch.setattr(shape_table, "_MAX_ROWS", 1)
+    assert shapes.find_rows([can]).tolist() == [0]
+    assert shapes.generation == 1

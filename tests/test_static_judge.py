@@ -504,3 +504,12 @@ def test_an_object_alone_topples_if_its_center_of_mass_is_beyond_its_foot(
     alone = SceneObject("own", own, Pose((0.1, 0.2, float(-low[2]))))
     assert high[0] - low[0] == pytest.approx(0.1)
     assert stands(alone) == (center < edge)
+
+
+@pytest.mark.parametrize("millimeters", [-4.7, 3.1, 15.2, 15.3])
+def test_stability_margins_are_multiples_of_a_tenth_of_a_millimeter(millimeters: float) -> None:
+    """Of a box that lies with its center this far inside of the edge."""
+    above = resting("sugar_box", xy=(0.115 - millimeters / 1000, 0.0), floor=0.060, name="above")
+    margins = STATIC_JUDGE.stability_margins(scene_of(BELOW, above))
+    assert not isinstance(margins, InconclusiveVerdict)
+    assert margins["above"] == pytest.approx(millimeters / 1000, abs=1e-9)
