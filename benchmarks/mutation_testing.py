@@ -93,6 +93,7 @@ TESTS = (
     "oracle_search",
     "step_by_step",
     "feasibility",
+    "earlier_names",
     "soft_q",
     "learned_generator",
     "generators",

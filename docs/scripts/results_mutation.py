@@ -27,17 +27,16 @@ def _score(name: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
     ]
 
 
-def _scores(rows: Sequence[Mapping[str, Any]]) -> str:
-    commits = Counter(row["commit"] for row in rows)
+def _scores(rows: Sequence[Mapping[str, Any]], sample: int, seed: int) -> str:
     text = section(
         "Scores",
-        f"{len(rows)} mutants, sampled uniformly, of the modules that decide results. *Caught*: a "
-        "test fails, the process ends, or the time limit is exceeded. *Equivalent*: the mutant "
-        "gives the same results as the original. Commits: "
-        + ", ".join(f"{commit} ({count})" for commit, count in sorted(commits.items()))
-        + ".",
+        f"Tested are {len(rows)} of {sample} mutants that were sampled uniformly from all mutants "
+        "of the modules that decide results; planning and the station come last. *Caught*: a test "
+        "fails, the process ends, or the time limit is exceeded. *Equivalent*: the mutant gives "
+        "the same results as the original. The results file names the content of the module, as a "
+        "Git blob, at which each mutant was tested.",
         command="python benchmarks/mutation_testing.py run --coverage FOLDER",
-        seed=0,
+        seed=seed,
         results=[RESULTS],
     )
     groups = dict.fromkeys(row["group"] for row in rows)
@@ -72,7 +71,8 @@ def _listed(title: str, method: str, rows: Iterable[Mapping[str, Any]], last: st
 
 def page() -> str:
     """Return the page."""
-    rows = read_benchmark_results("mutation_testing.json")["rows"]
+    results = read_benchmark_results("mutation_testing.json")
+    rows = results["rows"]
     intro = (
         "# Mutation testing\n\nHow many small faults of the code the tests notice. A mutant is the "
         "code with one change, such as `<=` in place of `<`. The tests that execute the changed "
@@ -83,7 +83,7 @@ def page() -> str:
     equivalent = [row for row in rows if row["outcome"] == "equivalent"]
     return intro + "\n".join(
         [
-            _scores(rows),
+            _scores(rows, results["count"], results["seed"]),
             _listed(
                 "Survivors",
                 "Mutants that no test catches. *Tests*: number of tests that were run.",
