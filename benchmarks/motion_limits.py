@@ -129,6 +129,7 @@ def limit_ratios(
     world = plant.world_frame()
     X_FG = cell.gripper.tools[plan.tool].X_FG
     torques, accelerations = np.empty(q.shape), np.zeros((len(q), 3))
+    down_G = np.zeros((len(q), 3))
     for k in range(len(q)):
         plant.SetPositions(context, q[k])
         plant.SetVelocities(context, v[k])
@@ -140,6 +141,7 @@ def limit_ratios(
             J = plant.CalcJacobianTranslationalVelocity(*frames, world, world)
             R_GW = (flange.CalcPoseInWorld(context).rotation() @ X_FG.rotation()).inverse()
             accelerations[k] = R_GW @ (J @ a[k] + bias)
+            down_G[k] = R_GW @ np.array([0.0, 0.0, -1.0])
     lower, upper = robot.position_limits.T
     ratios = {
         "position": (2 * q - lower - upper) / (upper - lower),
@@ -153,7 +155,7 @@ def limit_ratios(
     gripper = cell.gripper
     if payload.mass and isinstance(gripper, SuctionGripper):
         p_GCm = X_FG.inverse() @ np.array(payload.p_FCm)
-        wrench = payload_wrench(payload.mass, p_GCm, accelerations)
+        wrench = payload_wrench(payload.mass, p_GCm, down_G, accelerations)
         ratios["cup load"] = gripper.safety * gripper.load_ratio(plan.tool, *wrench)
     return {name: float(np.abs(ratio).max()) for name, ratio in ratios.items()}
 

@@ -10,6 +10,7 @@ from pydrake.math import RigidTransform
 from drake_clutter.assets import build_assets
 from drake_clutter.catalog import ObjectClass, load_catalog
 from drake_clutter.cell.gripper import GraspFailure, GraspSampling
+from drake_clutter.cell.payload_limits import DOWN_G
 from drake_clutter.cell.suction import SuctionGripper
 from drake_clutter.config import ClutterConfig, ExplorationConfig
 from drake_clutter.files import InputError
@@ -64,7 +65,7 @@ def test_the_cup_holds_above_the_center_of_mass(classes: dict[str, ObjectClass])
     assert abs(lever) == pytest.approx(0.006)
     assert p_TG[1:] == pytest.approx([0.1, 0.2])
     assert payload.p_FCm == pytest.approx((0.0, 0.0, 0.2223 + 0.16))
-    expected = suction.max_acceleration("single", 0.4, np.array([lever, 0.0, 0.16]))
+    expected = suction.max_acceleration("single", 0.4, np.array([lever, 0.0, 0.16]), DOWN_G)
     assert payload.max_acceleration == pytest.approx(expected, abs=0.051)
     # At rest, weight and bending open the lip of radius 12.5 mm.
     force = np.array([0.0, 0.0, 0.4 * 9.81])

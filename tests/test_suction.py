@@ -19,12 +19,11 @@ from pydrake.multibody.plant import MultibodyPlant
 from drake_clutter.assets import build_assets
 from drake_clutter.catalog import ObjectClass, RestOrientation, Shape, load_catalog
 from drake_clutter.cell.gripper import GraspFailure, GraspFailureReason, GraspSampling, Gripper
-from drake_clutter.cell.payload_limits import GRAVITY, payload_wrench
+from drake_clutter.cell.lip_seal import lip_flatness_deviation, lip_surface_profile, lip_tilt
+from drake_clutter.cell.payload_limits import DOWN_G, GRAVITY, payload_wrench
 from drake_clutter.cell.suction import (
     MAX_SEAL_GAP,
     SuctionGripper,
-    lip_flatness_deviation,
-    lip_surface_profile,
 )
 from drake_clutter.files import InputError
 from drake_clutter.simulation.scene_plant import rigid_transform
@@ -107,17 +106,45 @@ def test_an_edge_does_not_seal() -> None:
     assert lip_flatness_deviation(CLASSES["gelatin_box"], narrow, 0.030) == math.inf
 
 
-def test_tilt_and_curvature_increase_the_flatness_deviation() -> None:
-    """It is d tan(a) for a tilt a, and r - sqrt(r^2 - d^2 / 4) for a cylinder of radius r."""
-    found = lip_flatness_deviation(
-        CLASSES["cracker_box"], on_top(0.115, tilt=math.radians(5)), CUP.diameter
-    )
-    assert found == pytest.approx(CUP.diameter * math.tan(math.radians(5)), rel=1e-6)
+def test_tilt_and_curvature_are_told_apart() -> None:
+    """A plane deviates by nothing at any tilt, a cylinder by r - sqrt(r^2 - d^2 / 4)."""
+    box = CLASSES["cracker_box"]
+    for degrees in (0.0, 5.0, 20.0):
+        X_OG = on_top(0.115, tilt=math.radians(degrees))
+        assert lip_flatness_deviation(box, X_OG, CUP.diameter) == pytest.approx(0.0, abs=1e-12)
+        assert math.degrees(lip_tilt(box, X_OG, CUP.diameter)) == pytest.approx(degrees, abs=1e-6)
+        assert SUCTION.can_attach("single", box, X_OG) is (degrees <= SUCTION.max_tilt_deg)
     side = RigidTransform(ALONG_MINUS_X, [0.033, 0.0, 0.0])
     sagitta = 0.033 - math.sqrt(0.033**2 - 0.0125**2)
     assert lip_flatness_deviation(CLASSES["tomato_soup_can"], side, 0.025) == pytest.approx(
         sagitta, rel=0.1
     )  # of a prism of 32 sides
+
+
+def test_grasps_follow_the_normal_of_a_tilted_face() -> None:
+    """The lip touches the face, and the load has gravity in its true direction."""
+    box = CLASSES["pudding_box"]
+    tilt = math.radians(25)
+    R_TO = RotationMatrix.MakeYRotation(tilt) @ RotationMatrix.MakeYRotation(math.pi / 2)
+    X_TO = RigidTransform(R_TO, [0.1, -0.1, 0.08])
+    found = SUCTION.sample_grasps(box, X_TO, SAMPLING)
+    assert not isinstance(found, GraspFailure)
+    normal = R_TO.matrix()[:, 0]  # of the face of the shortest side
+    normal = normal * np.sign(normal[2])
+    for grasp in found:
+        assert grasp.X_TG.rotation().matrix()[:, 2] == pytest.approx(-normal, abs=1e-9)
+        p_OG = X_TO.inverse() @ grasp.X_TG.translation()
+        assert abs(p_OG[0]) == pytest.approx(box.size[0] / 2, abs=1e-9)
+        p_GCm = grasp.X_TG.inverse() @ X_TO.translation()
+        down_G = np.array(grasp.X_TG.rotation().inverse() @ np.array([0.0, 0.0, -1.0]))
+        assert down_G[2] == pytest.approx(math.cos(tilt))
+        force, moment = payload_wrench(box.mass, p_GCm, down_G, np.zeros(3))
+        ratio = SUCTION.load_ratio("single", force, moment)
+        assert ratio * SUCTION.safety < 1
+        assert np.linalg.norm(force) == pytest.approx(box.mass * GRAVITY)
+    steep = RigidTransform(RotationMatrix.MakeXRotation(math.radians(60)), [0.0, 0.0, 0.1])
+    can = CLASSES["tomato_soup_can"]
+    assert isinstance(SUCTION.sample_grasps(can, steep, SAMPLING), GraspFailure)
 
 
 def test_the_default_cup_is_the_widest_that_seals_on_all_objects() -> None:
@@ -197,22 +224,25 @@ def test_load_ratios_of_simple_loads() -> None:
 
 
 def test_the_wrench_of_a_load_at_rest_is_its_weight() -> None:
-    force, moment = payload_wrench(0.5, np.array([0.02, 0.0, 0.1]), np.zeros(3))
+    force, moment = payload_wrench(0.5, np.array([0.02, 0.0, 0.1]), DOWN_G, np.zeros(3))
     assert force == pytest.approx([0.0, 0.0, 0.5 * GRAVITY])
     assert moment == pytest.approx([0.0, -0.02 * 0.5 * GRAVITY, 0.0])
 
 
 def test_the_largest_acceleration_decreases_with_the_lever() -> None:
     """The lever is the distance of the center of mass; a load that is too heavy gives -1."""
-    low = SUCTION.max_acceleration("single", 0.4, np.array([0.0, 0.0, 0.0]))
-    high = SUCTION.max_acceleration("single", 0.4, np.array([0.0, 0.0, 0.15]))
+    low = SUCTION.max_acceleration("single", 0.4, np.array([0.0, 0.0, 0.0]), DOWN_G)
+    high = SUCTION.max_acceleration("single", 0.4, np.array([0.0, 0.0, 0.15]), DOWN_G)
     assert 0 < high < low
     ratio = SUCTION.load_ratio(
-        "single", *payload_wrench(0.4, np.array([0.0, 0.0, 0.15]), np.array([high, 0.0, 0.0]))
+        "single",
+        *payload_wrench(0.4, np.array([0.0, 0.0, 0.15]), DOWN_G, np.array([high, 0.0, 0.0])),
     )
     assert 0.8 / SUCTION.safety < ratio <= 1.001 / SUCTION.safety
     assert (
-        SUCTION.max_acceleration("single", SUCTION.holding_force("single") / GRAVITY, np.zeros(3))
+        SUCTION.max_acceleration(
+            "single", SUCTION.holding_force("single") / GRAVITY, np.zeros(3), DOWN_G
+        )
         == -1.0
     )
 
@@ -270,8 +300,8 @@ def test_the_profile_of_a_mesh_is_that_of_the_box_of_its_size(tmp_path: Path) ->
     assert lip_surface_profile(own, on_top(0.045), CUP.diameter) == pytest.approx(
         np.full(24, 0.010), abs=1e-7
     )
-    tilted = lip_flatness_deviation(own, on_top(0.035, tilt=math.radians(5)), CUP.diameter)
-    assert tilted == pytest.approx(CUP.diameter * math.tan(math.radians(5)), rel=1e-5)
+    tilted = lip_tilt(own, on_top(0.035, tilt=math.radians(5)), CUP.diameter)
+    assert tilted == pytest.approx(math.radians(5), rel=1e-5)
     assert lip_flatness_deviation(own, on_top(0.035, x=0.02), CUP.diameter) == math.inf
 
 

@@ -168,7 +168,7 @@ class Gripper(Protocol):
         X_TO: RigidTransform,
         sampling: GraspSampling,
     ) -> tuple[Grasp, ...] | GraspFailure:
-        """Return feasible grasps of an object from above, the preferred ones first.
+        """Return feasible grasps of an object, the preferred ones first.
 
         `can_attach` holds at each of them, moved back by `GraspSampling.lip_gap`.
 
@@ -176,6 +176,16 @@ class Gripper(Protocol):
             object_class: Class of the object.
             X_TO: Pose of the object.
             sampling: Parameters of the sampling.
+        """
+
+    def max_acceleration(self, tool: str, mass: float, p_GCm: Floats, down_G: Floats) -> float:
+        """Return the largest acceleration of a load, see `max_payload_acceleration`.
+
+        Args:
+            tool: Name of the tool.
+            mass: Mass of the load [kg].
+            p_GCm: Center of mass of the load [m]. Shape (3,).
+            down_G: Direction of gravity in G, a unit vector. Shape (3,).
         """
 
     def can_attach(self, tool: str, object_class: ObjectClass, X_OG: RigidTransform) -> bool:

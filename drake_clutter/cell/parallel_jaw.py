@@ -27,7 +27,7 @@ from drake_clutter.cell.gripper import (
     Tool,
 )
 from drake_clutter.cell.jaw_sdf import JawGeometry, jaw_sdf
-from drake_clutter.cell.payload_limits import max_payload_acceleration
+from drake_clutter.cell.payload_limits import DOWN_G, max_payload_acceleration
 from drake_clutter.validation import InRange, StrictModel
 
 Floats = NDArray[np.float64]
@@ -126,7 +126,7 @@ class ParallelJawGripper(StrictModel):
             R_TG = RotationMatrix(np.column_stack([np.cross(y, z), y, z]))
             X_TG = RigidTransform(R_TG, [*X_TO.translation()[:2], height])
             p_GCm = X_TG.inverse() @ p_TCm
-            acceleration = self.max_acceleration(object_class.mass, p_GCm)
+            acceleration = self.max_acceleration(JAWS, object_class.mass, p_GCm, DOWN_G)
             if acceleration < sampling.min_payload_acceleration:
                 continue
             x_F, y_F, z_F = (self.geometry.X_FG @ np.round(p_GCm, 2)).tolist()
@@ -169,9 +169,9 @@ class ParallelJawGripper(StrictModel):
         height = max(top - half, lowest, deepest)
         return height if height <= highest else None
 
-    def max_acceleration(self, mass: float, p_GCm: Floats) -> float:
-        """Return the largest acceleration of a load, see `max_payload_acceleration`."""
-        return max_payload_acceleration(mass, p_GCm, self.load_ratio, 1 / self.safety)
+    def max_acceleration(self, tool: str, mass: float, p_GCm: Floats, down_G: Floats) -> float:
+        """Return the largest acceleration of a load, see `Gripper`."""
+        return max_payload_acceleration(mass, p_GCm, down_G, self.load_ratio, 1 / self.safety)
 
     def load_ratio(self, force: Floats, moment: Floats) -> Floats:
         """Return the ratio of a load to the load capacity; the object slips above 1.

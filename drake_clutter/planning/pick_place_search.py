@@ -32,6 +32,7 @@ from drake_clutter.planning.time_parameterization import min_travel_time
 from drake_clutter.planning.tool_kinematics import (
     ToolKinematics,
     invert_pose,
+    is_vertical,
     retreat_along_axis,
     turn_about_axis,
 )
@@ -93,7 +94,8 @@ class PickPlaceSearch:
         placed = replace(picked, X_TO=X_TO_place)
         self._others = [o for o in objects if o is not picked]
         # Heights of the object's bottom: above its pick and place pose, or above a higher obstacle.
-        bottom = max(picked.bounds_T[0][2], placed.bounds_T[0][2])
+        self._place_bottom = placed.bounds_T[0][2]
+        bottom = max(picked.bounds_T[0][2], self._place_bottom)
         all_tops = (*obstacle_tops, *(o.top_height for o in self._others))
         tops = sorted({round(top, 3) for top in all_tops if top > bottom})
         lift_height = self._config.lift_height
@@ -127,21 +129,47 @@ class PickPlaceSearch:
         num_candidates = np.isfinite(travel_time).sum()
         num_solutions = self._robot.ik.num_solutions
         indices = [divmod(int(k), num_solutions) for k in order[:num_candidates]]
-        return [
-            GraspCandidate(
-                tool=grasp.tool,
-                payload=grasp.payload,
-                X_TG_pick=X_pick[k[0]],
-                X_TG_place=X_place[k[0]],
-                X_OG=RigidTransform(invert_pose(self._X_TO) @ X_pick[k[0]]),
-                insertion=grasp.insertion,
-                joints_open=grasp.joints_open,
-                joints_held=grasp.joints_held,
-                q_pick=q_pick[k],
-                q_place=q_place[k],
+        candidates = list[GraspCandidate]()
+        for k in indices:
+            X_TG_pick, X_TG_place = X_pick[k[0]], X_place[k[0]]
+            X_OG = RigidTransform(invert_pose(self._X_TO) @ X_TG_pick)
+            payload = self._payload(grasp, X_OG, X_TG_pick, X_TG_place)
+            if payload.max_acceleration < self._config.min_payload_acceleration:
+                mass = self._picked.object_class.mass
+                self.failures.record(0, PlanningFailureReason.TOO_HEAVY, "tilted", mass)
+                continue
+            candidates.append(
+                GraspCandidate(
+                    tool=grasp.tool,
+                    payload=payload,
+                    X_TG_pick=X_TG_pick,
+                    X_TG_place=X_TG_place,
+                    X_OG=X_OG,
+                    insertion=grasp.insertion,
+                    joints_open=grasp.joints_open,
+                    joints_held=grasp.joints_held,
+                    q_pick=q_pick[k],
+                    q_place=q_place[k],
+                )
             )
-            for k in indices
-        ]
+        return candidates
+
+    def _payload(
+        self, grasp: Grasp, X_OG: RigidTransform, X_TG_pick: Floats, X_TG_place: Floats
+    ) -> Payload:
+        """Return the load of a grasp, which the tool must hold at the tilts of both endpoints."""
+        if is_vertical(X_TG_pick) and is_vertical(X_TG_place):
+            return grasp.payload
+        downs = [-X_TG_pick[2, :3], -X_TG_place[2, :3]]
+        halfway = downs[0] + downs[1]
+        downs.append(halfway / np.linalg.norm(halfway))
+        object_class = self._picked.object_class
+        p_GCm = X_OG.inverse() @ object_class.center_of_mass
+        acceleration = min(
+            self._cell.gripper.max_acceleration(grasp.tool, object_class.mass, p_GCm, down_G)
+            for down_G in downs
+        )
+        return replace(grasp.payload, max_acceleration=acceleration)
 
     def _gripper_pose_at_pick(self, grasp: Grasp, yaw: float) -> Floats:
         """Return X_TG at the grasp, `PlannerConfig.lip_gap` above the surface. Shape (4, 4)."""
@@ -210,12 +238,15 @@ class PickPlaceSearch:
             return None
         # Without linear rows the configuration at the place pose results from the path.
         place = None
-        ends_at_q_place = self._robot.vertical_tool_rows is not None
+        ends_at_q_place = self._robot.vertical_tool_rows is not None or candidate.is_tilted
         if ends_at_q_place:
             place = self._place_endpoint(candidate, candidate.q_place)
             if place is None:
                 return None
-        gripper_height = candidate.X_TG_pick[2, 3] - self._picked.bounds_T[0][2]
+        gripper_height = max(
+            candidate.X_TG_pick[2, 3] - self._picked.bounds_T[0][2],
+            candidate.X_TG_place[2, 3] - self._place_bottom,
+        )
         # In a bowl or a mug, the gripper rises above the rim before it moves sideways.
         recess = max(0.0, self._picked.top_height - candidate.X_TG_pick[2, 3])
         for bottom in self._transfer_heights:

@@ -32,7 +32,12 @@ from drake_clutter.planning.time_parameterization import (
     parameterize_time_optimal,
     sample_path,
 )
-from drake_clutter.planning.tool_kinematics import CarryPath, ToolKinematics, raise_pose
+from drake_clutter.planning.tool_kinematics import (
+    CarryPath,
+    ToolKinematics,
+    is_vertical,
+    raise_pose,
+)
 from drake_clutter.planning.trajectory_optimization import (
     LinearizedDistances,
     TrajectoryOptimizationProblem,
@@ -87,6 +92,11 @@ class GraspCandidate:
     joints_held: tuple[float, ...]
     q_pick: Floats
     q_place: Floats
+
+    @property
+    def is_tilted(self) -> bool:
+        """Whether the tool does not point down at the grasp or at the place pose."""
+        return not (is_vertical(self.X_TG_pick) and is_vertical(self.X_TG_place))
 
 
 @dataclass(frozen=True)
@@ -276,7 +286,7 @@ class SegmentPlanner:
             if segment is None:
                 return None
             segments[name] = segment
-        if self._config.optimize:
+        if self._config.optimize and not candidate.is_tilted:
             segments = {
                 name: self._optimize_segment(segments[name], payload, candidate, endpoints)
                 for name, (_, payload) in candidates.items()
@@ -366,14 +376,15 @@ class SegmentPlanner:
     def _exceeds_tilt(self, candidate: GraspCandidate, path: Floats, progress: int) -> bool:
         """Return whether the tilt exceeds `MAX_CARRY_TILT`, and record that failure.
 
-        Paths of robots with `vertical_tool_rows` do not tilt the gripper.
+        Paths of robots with `vertical_tool_rows` do not tilt the gripper. The load of a tilted
+        grasp is planned for its tilt.
 
         Args:
             candidate: Grasp.
             path: Configurations. Shape (m, n).
             progress: Stage of planning, see `FailureLog.record`.
         """
-        if self._robot.vertical_tool_rows is not None:
+        if self._robot.vertical_tool_rows is not None or candidate.is_tilted:
             return False
         axis = self._tools[candidate.tool].axis(path)
         tilt = float(np.linalg.norm(axis[:, :2], axis=1).max())

@@ -16,6 +16,8 @@ from drake_clutter.robots.robot_model import RobotModel, load_robot
 
 Floats = NDArray[np.float64]
 
+DEPARTURE_DISTANCE = 0.02
+"""Distance that a tilted tool moves along its axis at the start of a lift [m]."""
 _MAX_POSE_STEP = 0.02
 """Largest distance between neighboring poses of a straight line [m]."""
 
@@ -79,6 +81,19 @@ def _vertical_line(X_TG: Floats, top: float) -> Floats:
     X = np.broadcast_to(X_TG, (len(heights), 4, 4)).copy()
     X[:, 2, 3] = heights
     return X
+
+
+def is_vertical(X_TG: Floats) -> bool:
+    """Return whether a tool points down at a pose. Shape (4, 4)."""
+    return bool(X_TG[2, 2] < -1 + 1e-6)
+
+
+def _departure(X_TG: Floats, top: float) -> Floats:
+    """Return poses along -z of G for a short distance, then up to a height [m]. Shape (m, 4, 4)."""
+    if is_vertical(X_TG):
+        return _vertical_line(X_TG, top)
+    moved_back = retreat_along_axis(X_TG, DEPARTURE_DISTANCE)
+    return np.vstack([X_TG[None], _vertical_line(moved_back, max(top, moved_back[2, 3]))])
 
 
 def _straight_line(X_TG: Floats, X_TG_end: Floats) -> Floats:
@@ -190,34 +205,36 @@ class ToolKinematics:
         q_pick: Floats,
         q_place: Floats,
     ) -> CarryPath | str:
-        """Return a path from a grasp to a place pose along which the gripper points down.
+        """Return a path from a grasp to a place pose.
 
-        A robot with `vertical_tool_rows` keeps the gripper vertical on a straight line in joint
-        space. Any other robot follows a straight line of the gripper; its configuration at the
-        place pose results from the path.
+        A tilted tool first moves along its axis, also at the place pose. A robot with
+        `vertical_tool_rows` keeps a vertical tool vertical on a straight line in joint space; a
+        tilted tool turns on such a line. Any other robot moves a vertical tool on a straight line;
+        its configuration at the place pose results from the path.
 
         Args:
             X_pick: X_TG at the grasp. Shape (4, 4).
             X_place: X_TG at the place pose. Shape (4, 4).
             transfer_height: Height of G between the two [m].
             q_pick: Joint positions at the grasp. Shape (n,).
-            q_place: Joint positions at the place pose; used only with `vertical_tool_rows`. Shape
-                (n,).
+            q_place: Joint positions at the place pose; not used without `vertical_tool_rows` if the
+                tool is vertical. Shape (n,).
 
         Returns:
             The path, or a description of the part that is out of reach.
         """
-        lift = self.track(_vertical_line(X_pick, transfer_height), q_pick)
+        lift = self.track(_departure(X_pick, transfer_height), q_pick)
         if lift is None:
             return "above the grasp"
-        above_place = _vertical_line(X_place, transfer_height)
-        if self.robot.vertical_tool_rows is not None:
+        above_place = _departure(X_place, transfer_height)
+        stays_vertical = is_vertical(X_pick) and is_vertical(X_place)
+        if self.robot.vertical_tool_rows is not None or not stays_vertical:
             reversed_lowering = self.track(above_place, q_place)
             if reversed_lowering is None:
                 return "above the place"
             transfer = linear_joint_path(lift[-1], reversed_lowering[-1])
             return CarryPath(lift, transfer, reversed_lowering)
-        X_lifted = _vertical_line(X_pick, transfer_height)[-1]
+        X_lifted = _departure(X_pick, transfer_height)[-1]
         tracked = self.track(_straight_line(X_lifted, above_place[-1]), lift[-1])
         if tracked is None:
             return "between grasp and place"

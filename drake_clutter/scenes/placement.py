@@ -6,11 +6,12 @@ from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 
-from drake_clutter.catalog import ObjectClass
+from drake_clutter.catalog import ObjectClass, RestOrientation, Shape
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.pinhole import MIN_DEPTH, point_to_camera, project
 from drake_clutter.cell.support import Support
@@ -35,6 +36,8 @@ _MAX_OFFSET_FRACTION = 0.25
 
 Farther off, an object would hang on one side of a rim.
 """
+_MAX_RESTING_TILT = np.radians(5.0)
+"""An object that is tilted by less counts as resting, and keeps its orientation [rad]."""
 _YAWS = (0.0, np.pi / 2)
 """Rotations of the picked object that are tried, in this order [rad]."""
 
@@ -125,6 +128,45 @@ class _OrientedObject(NamedTuple):
     height: float
     center_of_mass: NDArray[np.float64]
     footprint: NDArray[np.int64]
+
+
+def resting_quaternion(
+    object_class: ObjectClass, quaternion: tuple[float, float, float, float]
+) -> tuple[float, float, float, float]:
+    """Return the orientation at rest that is closest to an orientation.
+
+    An object that is nearly at rest keeps its orientation, and so does a mesh, whose faces are not
+    known here. A can is put upright, a marker on its side.
+
+    Args:
+        object_class: Class of the object.
+        quaternion: Quaternion of R_TO.
+    """
+    R_TO = Pose((0.0, 0.0, 0.0), quaternion).rotation
+    if object_class.shape is Shape.MESH:
+        return quaternion
+    is_upright = abs(R_TO[2, 2]) > np.cos(np.pi / 4)
+    if object_class.only_rest is not None:
+        is_upright = object_class.only_rest is RestOrientation.UPRIGHT
+    if object_class.shape is Shape.CYLINDER and not is_upright:
+        level = R_TO[:, 2] * [1.0, 1.0, 0.0]
+        turn = _rotation_between(R_TO[:, 2], level)
+    else:
+        is_can = object_class.shape is Shape.CYLINDER
+        axis = 2 if is_can else int(np.argmax(np.abs(R_TO[2])))
+        turn = _rotation_between(R_TO[:, axis], [0.0, 0.0, np.sign(R_TO[2, axis])])
+    if turn.magnitude() < _MAX_RESTING_TILT:
+        return quaternion
+    return Pose.from_rotation(turn.as_matrix() @ R_TO, (0.0, 0.0, 0.0)).quaternion
+
+
+def _rotation_between(start: ArrayLike, end: ArrayLike) -> Rotation:
+    """Return the smallest rotation that turns a direction (3,) into another one (3,)."""
+    a, b = (np.asarray(v, float) / np.linalg.norm(v) for v in (start, end))
+    axis = np.cross(a, b)
+    sine = float(np.linalg.norm(axis))
+    angle = np.arctan2(sine, a @ b)
+    return Rotation.from_rotvec(axis * (angle / sine) if sine > 0 else np.zeros(3))
 
 
 @lru_cache(maxsize=4096)
@@ -401,13 +443,14 @@ def find_free_placements(
     """Return the equally good placements for a move, or None if none is known.
 
     The object keeps its orientation, or is rotated by a quarter turn about the vertical if only
-    that fits. A placement is free where the camera sees through the space that the object will
-    occupy, with its clearance. Shadows and the space where the picked object still stands are not
-    free. On the support, the placements farthest from the center are returned: there the object
-    occludes least and leaves the most room. On an object, the placements nearest to the center of
-    the visible part of its top are returned; the center of mass is over that top. On an object that
-    is not convex, they are those nearest to its center of mass where the picked object balances on
-    level faces of its pieces: across the rim of a cup, or on its floor.
+    that fits; a tilted one is put down flat, see `resting_quaternion`. A placement is free where
+    the camera sees through the space that the object will occupy, with its clearance. Shadows and
+    the space where the picked object still stands are not free. On the support, the placements
+    farthest from the center are returned: there the object occludes least and leaves the most room.
+    On an object, the placements nearest to the center of the visible part of its top are returned;
+    the center of mass is over that top. On an object that is not convex, they are those nearest to
+    its center of mass where the picked object balances on level faces of its pieces: across the rim
+    of a cup, or on its floor.
 
     Args:
         observation: Observation before the pick.
@@ -437,10 +480,9 @@ def _search_placements(
         surfaces = [_Candidates(0.0, *_tray_candidates(observation.support))]
     elif len(target.object_class.convex_pieces) == 1:
         surfaces = [_Candidates(top_height(target), *_top_candidates(observation, target))]
+    quaternion = resting_quaternion(picked.object_class, picked.X_TO.quaternion)
     for yaw in _YAWS:
-        oriented = _orient_object(
-            picked.object_class, picked.X_TO.quaternion, yaw, config.clearance
-        )
+        oriented = _orient_object(picked.object_class, quaternion, yaw, config.clearance)
         if target is not None and len(target.object_class.convex_pieces) > 1:
             surfaces = _candidates_on_pieces(
                 observation, target, picked.object_class, oriented.quaternion

@@ -13,7 +13,8 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
-from drake_clutter.cell.suction import SuctionGripper, lip_surface_profile
+from drake_clutter.cell.lip_seal import lip_surface_profile
+from drake_clutter.cell.suction import SuctionGripper
 from drake_clutter.station.clutter_station import ClutterStation
 
 GRIPPER_UPDATE_PERIOD = 0.01

@@ -1,0 +1,80 @@
+"""Tilted objects: grasped along their normal, lifted along it, and put down flat."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from conftest import CLASSES, DEFAULT_CELL, resting, scene_of
+from scipy.spatial.transform import Rotation
+
+from drake_clutter.config import ExplorationConfig
+from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.planning.pick_place_plan import PickPlacePlan
+from drake_clutter.planning.pick_place_planner import PickPlacePlanner
+from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.planning.tool_kinematics import DEPARTURE_DISTANCE
+from drake_clutter.scenes.interfaces import Move
+from drake_clutter.scenes.placement import find_free_placements, resting_quaternion
+from drake_clutter.scenes.scene import Pose, SceneObject
+from drake_clutter.station.station_simulation import StationSimulation
+
+# A sugar box that leans on a pudding box, at rest; its widest face is tilted by 13.9 degrees.
+LEANING = SceneObject(
+    "sugar_box",
+    CLASSES["sugar_box"],
+    Pose((-0.0196011, 0.0, 0.0394415), (0.7875880172, -1.867e-07, 0.6162021708, -7.159e-08)),
+)
+SCENE = scene_of(LEANING, resting("pudding_box", xy=(0.096, 0.0)))
+NORMAL = LEANING.X_TO.rotation[:, 0] * np.sign(LEANING.X_TO.rotation[2, 0])
+
+
+def test_a_leaning_box_is_put_down_flat(detector: LabelDetector) -> None:
+    observation = detector.perceive(SCENE).observation
+    free = find_free_placements(observation, Move("sugar_box"), ExplorationConfig())
+    assert free is not None
+    translation = next(p for p in free.translations.tolist() if p[0] < 0 and p[1] < 0)
+    place = Pose(tuple(translation), free.quaternion)
+    assert abs(place.rotation[2, 0]) == pytest.approx(1.0), "on its widest face"
+    planner = PickPlacePlanner(DEFAULT_CELL, PlannerConfig())
+    plan = planner.plan(SCENE.objects, "sugar_box", place)
+    assert isinstance(plan, PickPlacePlan)
+    tool, carry = planner.tools[plan.tool], plan.segments[1].trajectory
+    X_TG = tool.pose(carry.vector_values(np.linspace(0.0, carry.end_time(), 400)).T)
+    assert X_TG[0, :3, 2] == pytest.approx(-NORMAL, abs=1e-3)
+    assert X_TG[-1, :3, 2] == pytest.approx([0.0, 0.0, -1.0], abs=1e-3)
+    lift = X_TG[:, :3, 3] - X_TG[0, :3, 3]
+    along = lift @ NORMAL
+    first = (along > 1e-4) & (along < DEPARTURE_DISTANCE / 2)
+    assert first.sum() > 3
+    sideways = np.linalg.norm(lift[first] - np.outer(along[first], NORMAL), axis=1)
+    assert (sideways < 0.2 * along[first]).all(), "along the normal first"
+    result = StationSimulation(DEFAULT_CELL, SCENE).execute(plan)
+    assert not result.lost_object
+    assert result.position_error < 0.003
+    assert result.orientation_error < math.radians(1)
+    assert max(result.displacements.values()) < 0.001
+
+
+@pytest.mark.parametrize(
+    ("name", "rpy", "rested"),
+    [
+        ("sugar_box", (20, 0, 30), (0, 0, 30)),
+        ("sugar_box", (0, 70, 0), (0, 90, 0)),
+        ("tomato_soup_can", (40, 0, 0), (0, 0, 0)),
+        ("tomato_soup_can", (60, 0, 0), (0, 0, 0)),
+        ("large_marker", (0, 70, 0), (0, 90, 0)),
+    ],
+)
+def test_the_closest_resting_orientation(
+    name: str, rpy: Sequence[float], rested: Sequence[float]
+) -> None:
+    def quaternion(angles: Sequence[float]) -> tuple[float, float, float, float]:
+        w, x, y, z = Rotation.from_euler("xyz", angles, degrees=True).as_quat(scalar_first=True)
+        return w, x, y, z
+
+    found = Pose((0.0, 0.0, 0.0), resting_quaternion(CLASSES[name], quaternion(rpy))).rotation
+    assert found == pytest.approx(Pose((0.0, 0.0, 0.0), quaternion(rested)).rotation, abs=1e-9)
+    slight = quaternion((2, 1, 0))
+    if name != "large_marker":
+        assert resting_quaternion(CLASSES[name], slight) == slight
