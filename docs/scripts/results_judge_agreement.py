@@ -65,6 +65,53 @@ def _scenes(results: Mapping[str, Any]) -> str:
     )
 
 
+def _meshes() -> str:
+    results = read_benchmark_results("mesh_judges.json")
+    rows = results["rows"]
+    text = section(
+        "Objects that are not convex",
+        "Scenes with a mug, a bottle, a bowl and a plate beside a box and a can, judged by their "
+        "convex pieces, and by Drake. Columns as above. The hill climber concentrates on the "
+        "judge's errors.",
+        command="python benchmarks/mesh_agreement.py runs/meshes --out FILE",
+        seed=rows[0]["seed"],
+        results=["benchmarks/results/mesh_judges.json"],
+    )
+    head = ["generator", "nodes", "scenes", "verdicts equal", "false stable", "false unstable"]
+    text += table(
+        [*head, "inconclusive", "hidden lists equal"],
+        [
+            [
+                row["agent"],
+                str(row["nodes"]),
+                str(row["count"]),
+                estimate(row, "agreement", "agreement_ci95", 3),
+                number(row["false_stable_rate"], 3),
+                number(row["false_unstable_rate"], 3),
+                number(row["inconclusive_fraction"], 3),
+                number(row["hidden_agreement"], 3),
+            ]
+            for row in rows
+        ],
+    )
+    text += "\nStacks that hold an object of the class:\n\n"
+    return text + table(
+        ["generator", "class", "objects", "stacks", "verdicts equal", "inconclusive"],
+        [
+            [
+                row["agent"],
+                name,
+                str(row["objects_by_class"][name]),
+                str(stacks["count"]),
+                estimate(stacks, "agreement", "agreement_ci95", 3),
+                number(stacks["inconclusive_fraction"], 3),
+            ]
+            for row in rows
+            for name, stacks in row["by_class_in_group"].items()
+        ],
+    )
+
+
 def _drake_itself(results: Mapping[str, Any]) -> str:
     text = section(
         "Drake with other settings",
@@ -285,4 +332,5 @@ def page() -> str:
     )
     parts = [_scenes, _drake_itself, _moves, _reasons, _classes, _sensitivity]
     texts = [part(results) for part in parts]
+    texts.insert(1, _meshes())
     return intro + "\n".join([*texts, _speed(), _oracle(), _drake_versions()])
