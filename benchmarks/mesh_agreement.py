@@ -99,9 +99,10 @@ class CrockeryBatch(SceneBatch):
 
     def lay_out(self, index: int) -> tuple[Scene, np.random.Generator]:
         """Return a scene, and the random generator that a judge draws offsets from next."""
+        scene, state = _lay_out(self.agent, self.folder, self.nodes, self.seed, index)
         rng = item_rng(self.seed, index)
-        generator = _scene_generator(self.agent, self.folder, self.nodes, self.seed)
-        return generator.lay_out(rng)[0], rng
+        rng.bit_generator.state = state
+        return scene, rng
 
 
 @lru_cache(maxsize=4)
@@ -110,9 +111,17 @@ def _scene_generator(agent: str, folder: str, nodes: int, seed: int) -> SceneGen
     return SceneGenerator(job)
 
 
+@lru_cache(maxsize=1024)  # as the hill climber takes seconds for a scene
+def _lay_out(agent: str, folder: str, nodes: int, seed: int, index: int) -> tuple[Scene, Any]:
+    """Return a scene, and the state of the random generator after it."""
+    rng = item_rng(seed, index)
+    scene, _ = _scene_generator(agent, folder, nodes, seed).lay_out(rng)
+    return scene, rng.bit_generator.state
+
+
 SCENES_BY_BATCH = {
-    CrockeryBatch(OBJECT_SET, 12, 1, agent="random"): 120,
-    CrockeryBatch(OBJECT_SET, 12, 1, agent="hill-climbing"): 60,
+    CrockeryBatch(OBJECT_SET, 12, 1, agent="random"): 100,
+    CrockeryBatch(OBJECT_SET, 12, 1, agent="hill-climbing"): 20,
 }
 """Number of scenes of each batch in the published results."""
 

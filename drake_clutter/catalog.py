@@ -121,7 +121,8 @@ class ClassEntry(StrictModel):
         pairs: Arrangements in which two objects of the class stand as a pair.
         only_rest: Only orientation at rest (cans stand, a marker lies); None if it varies.
         mesh: Path of a closed mesh, relative to the catalog; for shape mesh only. glTF files are y
-            up, all others z up.
+            up, all others z up. Its convex pieces have at most 128 corners; `assets build` prints
+            how far they deviate from it.
         mesh_unit: Unit of the mesh's coordinates.
         label: How its texture is drawn.
     """
