@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.cell.camera import Camera
+from drake_clutter.perception.mesh_pose_fit import POINT_SPACING, fit_mesh, surface_points
 from drake_clutter.perception.pose_candidates import (
     EXTENT_TOLERANCES,
     MIN_POINTS,
@@ -106,7 +107,10 @@ def _snap_to_rest(cylinder: bool, R_TO: Floats) -> Floats | None:
 
 
 def _sample_surface(object_class: ObjectClass) -> Floats:
-    """Return points on the whole surface of a box or cylinder in its frame [m]. Shape (N, 3)."""
+    """Return points on the whole surface of an object in its frame [m]. Shape (N, 3)."""
+    if object_class.shape is Shape.MESH:
+        points = surface_points(object_class)
+        return points[:: max(1, round((MODEL_POINT_SPACING / POINT_SPACING) ** 2))]
     half = np.asarray(object_class.size) / 2
     x, y, z = (np.linspace(-h, h, max(2, math.ceil(2 * h / MODEL_POINT_SPACING))) for h in half)
     if object_class.shape is Shape.BOX:
@@ -122,7 +126,7 @@ def _sample_surface(object_class: ObjectClass) -> Floats:
 
 
 class PoseFitter:
-    """Fit the poses of boxes and cylinders to segments of a depth image."""
+    """Fit the poses of objects to segments of a depth image."""
 
     def __init__(self, camera: Camera) -> None:
         """Create a fitter for a camera's images."""
@@ -139,7 +143,7 @@ class PoseFitter:
         """Fit the pose of one segmented object.
 
         Args:
-            object_class: Class of the object, a box or a cylinder.
+            object_class: Class of the object.
             mask: Pixels of the segment. Shape (H, W).
             depth: Measured depth [m]; inf, 0 or NaN where there is no measurement. Shape (H, W).
             p_TO_guess: Rough position of the center [m]; it decides what the image leaves open.
@@ -149,10 +153,8 @@ class PoseFitter:
             The best pose; None if too few points were measured or no candidate is good enough.
 
         Raises:
-            ValueError: The class is a mesh, or an image does not have the camera's size.
+            ValueError: An image does not have the camera's size.
         """
-        if object_class.shape is Shape.MESH:
-            raise ValueError(f"class {object_class.name} is a mesh; expected boxes and cylinders")
         size = (self.camera.height, self.camera.width)
         if mask.shape != size or depth.shape != size:
             raise ValueError(
@@ -168,6 +170,15 @@ class PoseFitter:
         points, edge_points = sample_segment_points(view, MAX_POINTS)
         if len(points) < MIN_POINTS:
             return None
+        if object_class.shape is Shape.MESH:
+            R_TO, p_TO, score = fit_mesh(
+                object_class,
+                points,
+                view,
+                self.camera,
+                lambda R, p: self._align_by_icp(object_class, R, p, points),
+            )
+            return FittedPose(Pose.from_rotation(R_TO, p_TO), score) if score > 0 else None
         cylinder = object_class.shape is Shape.CYLINDER
         half = np.asarray(object_class.size) / 2
         for tolerance in EXTENT_TOLERANCES:

@@ -16,6 +16,7 @@ from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.pinhole import pose_to_camera
 from drake_clutter.compilation import njit
+from drake_clutter.perception.mesh_pose_fit import render_mesh
 from drake_clutter.perception.pose_score import (
     camera_position_in_object,
     cast_ray_row,
@@ -126,11 +127,13 @@ def evaluate_pose(
     """Compare an object at a pose with a depth image.
 
     Args:
-        object_class: A box or a cylinder.
+        object_class: Class of the object.
         X_TO: Pose of the object in the tray frame.
         depth: Measured depth [m]; 0 or infinite where there is no measurement. Shape (H, W).
         camera: Camera of the depth image.
     """
+    if object_class.shape is Shape.MESH:
+        return _evaluate_mesh_pose(object_class, X_TO, depth, camera)
     top, left, result, rendered, num_covered = _compare_with_depth(
         object_class.shape is Shape.CYLINDER,
         np.asarray(object_class.size) / 2,
@@ -142,6 +145,26 @@ def evaluate_pose(
     num_violations = int(np.count_nonzero(result == _FREE_SPACE))
     return PoseEvidence(
         top, left, result == _CONSISTENT, rendered, num_violations, int(num_covered)
+    )
+
+
+def _evaluate_mesh_pose(
+    object_class: ObjectClass, X_TO: Pose, depth: NDArray[np.float32], camera: Camera
+) -> PoseEvidence:
+    """Compare a mesh at a pose with a depth image, see `evaluate_pose`."""
+    top, left, expected = render_mesh(object_class, X_TO.rotation, X_TO.p, camera)
+    rows, columns = expected.shape
+    measured = depth[top : top + rows, left : left + columns]
+    is_covered = np.isfinite(expected)
+    is_compared = is_covered & (measured > 0.05) & (measured < 50.0)
+    difference = np.where(is_compared, measured - np.where(is_covered, expected, 0), -np.inf)
+    return PoseEvidence(
+        top,
+        left,
+        np.abs(difference) <= DEPTH_TOLERANCE,
+        np.where(is_covered, expected, 0).astype(np.float32),
+        int(np.count_nonzero(difference > DEPTH_TOLERANCE)),
+        int(np.count_nonzero(is_covered)),
     )
 
 
