@@ -76,6 +76,10 @@ def test_the_residual_of_an_overhang(direction: tuple[float, float]) -> None:
         expected = [least(max(lever, 0.0))]
         assert residuals(offsets=[offset]) == pytest.approx(expected, abs=1e-9)
         assert residuals(com=(*offset, 0.01)) == pytest.approx(expected, abs=1e-9)
+        # Offset and center of mass add up.
+        apart = [offset - 0.03 * direction_array]
+        found = residuals(offsets=apart, com=(*(0.03 * direction_array), 0.01))
+        assert found == pytest.approx(expected, abs=1e-9)
     assert residuals(offsets=[foot * direction_array], margin=0.01) == pytest.approx([least(0.01)])
 
 
