@@ -143,6 +143,21 @@ def _grasp_row(row: Mapping[str, Any]) -> list[str]:
     ]
 
 
+def _grippers() -> str:
+    results = read_benchmark_results("gripper_scenes.json")
+    text = section(
+        "Scenes within reach of a gripper",
+        "Scenes in which no hidden object stays behind objects that the gripper cannot grasp, an "
+        "upper bound on the scenes that the arm can solve. `one cup` is the default cell without "
+        "its small cup.",
+        command=f"python {results['command']} --out FILE",
+        seed=f"dataset `{results['dataset']}`",
+        results=["benchmarks/results/gripper_scenes.json"],
+    )
+    body = [[row["cell"], _fraction(row["solvable"])] for row in results["rows"]]
+    return text + table(["gripper", "solvable"], body)
+
+
 def page() -> str:
     """Return the page."""
     intro = (
@@ -150,4 +165,4 @@ def page() -> str:
         "([motion planning](../explanation/motion_planning.md), "
         "[arm simulation](../explanation/arm_simulation.md)). Intervals are 95 %.\n\n"
     )
-    return intro + "\n".join([_moves(), _parts(), _grasps()])
+    return intro + "\n".join([_moves(), _parts(), _grasps(), _grippers()])
