@@ -29,7 +29,7 @@ from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.validation import CountOrZero, Finite
-from training.results_file import ResultsFile, Row, collect_records, provenance
+from training.results_file import ResultsFile, Row, collect_records
 from training.script import SCENES, ResultsOption, WorkersOption, print_table, run_script
 
 DATASETS = ("rg_25", "hill_climbing_25", "sg_25", "sg_star_25", "sg_14")
@@ -181,7 +181,9 @@ def measure(name: str, simulator: str, count: int, folder: Path, workers: int) -
         "at_rest_ci95": wilson_interval(num_at_rest, count),
         "displacements_mm": displacements,
         **describe_machine(simulator),
-        **provenance(),
+        # Of the simulations, which an interrupted run may have made earlier.
+        "software_version": records[-1]["software_version"],
+        "commit": records[-1]["commit"],
     }
 
 

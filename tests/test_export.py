@@ -177,14 +177,20 @@ def check_in_pybullet(scene: Scene, main_file: Path, client: int) -> None:
         ] == pytest.approx(scene[name].X_TO.p[2], abs=0.015)
 
 
-def test_cylinders_have_their_size_in_pybullet(bullet: int, tmp_path: Path) -> None:
-    """PyBullet inflates cylinders by 1 mm, for which the exported ones are smaller."""
-    cylinders = [
+def test_objects_have_their_size_in_pybullet(bullet: int, mug: ObjectClass, tmp_path: Path) -> None:
+    """PyBullet inflates cylinders and meshes by 1 mm, for which the exported ones are smaller."""
+    upright = Pose.from_rotation(np.eye(3), (-0.2, 0.2, mug.size[2] / 2))
+    lying = Pose.from_rotation(
+        Rotation.from_euler("x", np.pi / 2).as_matrix(), (0.2, 0.2, mug.size[1] / 2)
+    )
+    objects = [
+        SceneObject("mug", mug, upright),
+        SceneObject("lying mug", mug, lying),
         resting("large_marker", xy=(0.2, 0.0)),
         resting("tomato_soup_can", Orientation.UPRIGHT_0),
         resting("tomato_soup_can", Orientation.FLAT_0, (-0.2, 0.0), name="lying can"),
     ]
-    path = export_scene(scene_of(*cylinders), ExportFormat.SDF, tmp_path)
+    path = export_scene(scene_of(*objects), ExportFormat.SDF, tmp_path)
     tray, *bodies = pybullet.loadSDF(str(path.with_name(PYBULLET_FILE)), physicsClientId=bullet)
     for body in bodies:
         contacts = pybullet.getClosestPoints(tray, body, 0.01, physicsClientId=bullet)

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.optimize import linprog
+from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.cell.support import Support
@@ -22,6 +24,8 @@ from drake_clutter.scenes.scene import Scene
 
 Floats = NDArray[np.float64]
 """An array of floats."""
+_MIN_BALL_RADIUS = 1e-5
+"""Radius of the largest ball in a mesh below which the mesh counts as flat [m]."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +116,34 @@ def support_boxes(support: Support) -> list[SupportBox]:
         )
         boxes.append(SupportBox(visual.get("name", ""), size, pose[:3], color))
     return boxes
+
+
+def deflate_convex_mesh(path: Path, deflated: Path, margin: float) -> None:
+    """Write a convex mesh whose faces lie deeper by a margin.
+
+    A mesh that is thinner than twice the margin is copied.
+
+    Args:
+        path: The mesh.
+        deflated: The file to write.
+        margin: Distance of the faces from those of the mesh [m].
+    """
+    # Each row is a face: outer normal n and offset d with n @ p + d <= 0 inside.
+    faces = ConvexHull(trimesh.load_mesh(path).vertices).equations
+    faces[:, 3] += margin
+    # The center and radius of the largest ball between the faces.
+    ball = linprog(
+        [0, 0, 0, -1],
+        A_ub=np.column_stack([faces[:, :3], np.ones(len(faces))]),
+        b_ub=-faces[:, 3],
+        bounds=[(None, None)] * 3 + [(None, None)],
+    ).x
+    if ball[3] < _MIN_BALL_RADIUS:
+        shutil.copyfile(path, deflated)
+        return
+    corners = HalfspaceIntersection(faces, ball[:3]).intersections
+    text = trimesh.exchange.obj.export_obj(trimesh.Trimesh(corners).convex_hull)
+    deflated.write_text(text, encoding="utf-8")
 
 
 def write_class_meshes(object_class: ObjectClass, folder: Path) -> list[str]:

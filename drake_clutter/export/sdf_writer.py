@@ -11,6 +11,7 @@ from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.export.model_parts import (
     can_roll,
     classes_in_scene,
+    deflate_convex_mesh,
     format_numbers,
     write_class_meshes,
     write_xml,
@@ -75,8 +76,19 @@ def _add_pybullet_friction(model: ElementTree.Element) -> None:
         ElementTree.SubElement(contact, "rolling_friction").text = repr(scaled)
 
 
-def _deflate_cylinders(model: ElementTree.Element) -> None:
-    """Make the cylinders of a model smaller by PyBullet's margin, which lifts stacks otherwise."""
+def _deflate(model: ElementTree.Element, folder: Path) -> None:
+    """Make the cylinders and meshes of a model smaller by PyBullet's margin, which lifts stacks.
+
+    Args:
+        model: Element of a model, which is changed.
+        folder: Folder of the export, which receives the smaller meshes.
+    """
+    for uri in model.iterfind("link/collision/geometry/mesh/uri"):
+        original = folder / (uri.text or "")
+        deflated = original.with_stem(f"{original.stem}_pybullet")
+        if not deflated.exists():
+            deflate_convex_mesh(original, deflated, _PYBULLET_MARGIN)
+        uri.text = deflated.relative_to(folder).as_posix()
     for cylinder in model.iterfind("link/collision/geometry/cylinder"):
         for name, margins in (("radius", 1), ("length", 2)):
             element = cylinder.find(name)
@@ -105,8 +117,8 @@ def _pose_text(pose: Pose) -> str:
 def write_sdf(scene: Scene, folder: Path) -> Path:
     """Write a world with one model per object, and meshes per class.
 
-    `scene_pybullet.sdf` is `scene.sdf` with friction and cylinders as PyBullet reads them. Returns
-    the path of `scene.sdf`.
+    `scene_pybullet.sdf` is `scene.sdf` with friction, cylinders and meshes as PyBullet reads them.
+    Returns the path of `scene.sdf`.
     """
     # Without this, the prefix would be renamed, and Drake would not recognize it.
     ElementTree.register_namespace("drake", _DRAKE)
@@ -135,6 +147,6 @@ def write_sdf(scene: Scene, folder: Path) -> Path:
     write_xml(path, root)
     for model in world.iter("model"):
         _add_pybullet_friction(model)
-        _deflate_cylinders(model)
+        _deflate(model, folder)
     write_xml(folder / PYBULLET_FILE, root)
     return path
