@@ -326,11 +326,39 @@ def _speed() -> str:
     )
 
 
+def _maskable_ppo() -> str:
+    results = read_benchmark_results("maskable_ppo.json")
+    text = section(
+        "MaskablePPO",
+        f"sb3-contrib's `MaskablePPO` on graphs of {results['nodes']} nodes, trained by "
+        "`examples/09_train_maskable_ppo.py`, after some minutes of processor time. Untrained, it "
+        "chooses rules at random. Scenes are judged by the static model; *hidden*: objects per "
+        "scene, 0 if it is not stable. [Intervals](intervals.md) are 95 %.",
+        command="python benchmarks/maskable_ppo.py FOLDER --out FILE",
+        seed=results["seed"],
+        results=["benchmarks/results/maskable_ppo.json"],
+    )
+    return text + table(
+        ["time [min]", "steps", "episodes", "return", "hidden", "stable"],
+        [
+            [
+                str(row["minutes"]),
+                str(row["steps"]),
+                str(row["episodes"]),
+                number(row["return_mean"]),
+                estimate(row, "hidden_mean", "hidden_ci95"),
+                estimate(row, "stable", "stable_ci95"),
+            ]
+            for row in results["rows"]
+        ],
+    )
+
+
 def page() -> str:
     """Return the page."""
     intro = "# Scene generation\n\nScene generators compared by Drake.\n\n" + table(
         ["name", "`--agent`", "generator"],
         [[name, f"`{agent}`", text] for name, agent, text in _NAMES],
     )
-    parts = (_scenes(), _trainings(), _sampled(), _disassembly(), _speed())
+    parts = (_scenes(), _trainings(), _sampled(), _disassembly(), _speed(), _maskable_ppo())
     return intro + "\n" + "\n".join(parts)
