@@ -18,6 +18,7 @@ from drake_clutter.planning.motion_limits import (
     LimitViolation,
     MotionLimits,
     MotionSamples,
+    scale_time,
     scale_to_limits,
     time_scales,
     to_scipy,
@@ -155,9 +156,9 @@ def parameterize_time_optimal(
         scale = float(scales.max())
         if not math.isfinite(scale):
             return scale_to_limits(_uniform_bspline(points), limits)
-        duration = max(scale, 1.0) * len(points)
-        if duration < shortest:
-            shortest, best = duration, _uniform_bspline(points)
+        scale = max(scale, 1.0)
+        if scale * len(points) < shortest:
+            shortest, best = scale * len(points), scale_time(_uniform_bspline(points), scale)
         if scale <= 1 + LIMIT_TOLERANCE:
             break
         # The smoothing mixes accelerations within half its width on either side.
