@@ -129,6 +129,47 @@ def _grasps() -> str:
     )
 
 
+LIMITS = {
+    "position": "position",
+    "velocity": "velocity",
+    "acceleration": "acceleration",
+    "jerk": "jerk",
+    "torque": "torque",
+    "load acceleration": "acceleration of the load",
+    "cup load": "load of the cup, with safety factor",
+}
+"""Limits by their names in the results file."""
+
+
+def _limits() -> str:
+    results = read_benchmark_results("motion_limits.json")
+    rows = results["rows"]
+    text = section(
+        "Limits of motions",
+        "Random moves of the UR10, UR3e, UR5e, UR10e, UR16e and iiwa 14, each planned without and "
+        "with optimization. Ratios to the limits are those of the returned trajectories at 500 Hz, "
+        "with Drake's dynamics. *Time-optimal*: TOPP-RA along the same path without a limit of "
+        "jerk, with steps of the acceleration also at rest.",
+        command=f"python {results['command']} --out FILE",
+        seed=results["seed"],
+        results=[
+            "benchmarks/results/motion_limits.json",
+            "benchmarks/results/motion_limits.jsonl.gz",
+        ],
+    )
+    body = [
+        ["plans", *(str(row["count"]) for row in rows)],
+        ["plans that exceed a limit by 1 %", *(str(row["exceeded"]) for row in rows)],
+        *(
+            [f"largest ratio: {name}", *(number(row["largest"][key], 3) for row in rows)]
+            for key, name in LIMITS.items()
+        ),
+        ["duration, median [s]", *(number(row["duration_s"]) for row in rows)],
+        ["duration / time-optimal, median", *(number(row["of_time_optimal"], 3) for row in rows)],
+    ]
+    return text + table(["", *(row["plans"] for row in rows)], body)
+
+
 def _grasp_row(row: Mapping[str, Any]) -> list[str]:
     others = [f"{count} {reason}" for reason, count in row["results"].items()]
     others = [text for text in others if not text.endswith("carried out")]
@@ -165,4 +206,4 @@ def page() -> str:
         "([motion planning](../explanation/motion_planning.md), "
         "[arm simulation](../explanation/arm_simulation.md)). Intervals are 95 %.\n\n"
     )
-    return intro + "\n".join([_moves(), _parts(), _grasps(), _grippers()])
+    return intro + "\n".join([_moves(), _limits(), _parts(), _grasps(), _grippers()])
