@@ -1,12 +1,13 @@
 """Trajectory files: round trip, refusal of other files, and replay from the command line."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from conftest import DEFAULT_CELL, executed, resting, rng, scene_of, tray
+from conftest import ONE_CUP, cell_with, executed, resting, rng, scene_of, tray
 from typer.testing import CliRunner
 
 from drake_clutter.catalog import load_catalog
@@ -20,6 +21,8 @@ from drake_clutter.station.arm_executor import ArmExecutor
 from drake_clutter.station.trajectory_file import read_trajectories, write_trajectories
 from ur10 import LINKS
 
+CELL = cell_with(ONE_CUP)
+"""Cell whose gripper does not hold the marker."""
 SCENE = scene_of(
     resting("pudding_box"),
     resting("gelatin_box", floor=0.035),
@@ -30,14 +33,17 @@ MOVES = (Move("gelatin_box"), Move("large_marker"))
 
 @pytest.fixture(scope="module")
 def outcomes(config: ClutterConfig, detector: LabelDetector) -> list[tuple[Move, Outcome]]:
-    observation, executor = detector.perceive(SCENE).observation, ArmExecutor(config)
+    observation, executor = (
+        detector.perceive(SCENE).observation,
+        ArmExecutor(replace(config, cell=CELL)),
+    )
     return [(move, executed(executor, SCENE, observation, move, rng())) for move in MOVES]
 
 
 @pytest.fixture
 def file(outcomes: list[tuple[Move, Outcome]], tmp_path: Path) -> Path:
     path = tmp_path / "trajectory.h5"
-    assert write_trajectories(path, SCENE, outcomes, DEFAULT_CELL) == 1, "the marker is not moved"
+    assert write_trajectories(path, SCENE, outcomes, CELL) == 1, "the marker is not moved"
     return path
 
 
@@ -45,7 +51,7 @@ def test_written_trajectories_are_read_back(
     file: Path, outcomes: list[tuple[Move, Outcome]]
 ) -> None:
     scene, cell, moves = read_trajectories(file, load_catalog())
-    assert cell == DEFAULT_CELL
+    assert cell == CELL
     assert scene.poses == SCENE.poses
     ((move, motion),) = moves
     assert move == MOVES[0]
@@ -61,11 +67,11 @@ def test_written_trajectories_are_read_back(
 def test_the_cell_of_a_file_has_the_support_of_the_scene(
     outcomes: list[tuple[Move, Outcome]], tmp_path: Path
 ) -> None:
-    path, other = tmp_path / "trajectory.h5", DEFAULT_CELL.with_support(tray(0.9))
+    path, other = tmp_path / "trajectory.h5", CELL.with_support(tray(0.9))
     write_trajectories(path, SCENE, outcomes, other)
     scene, cell, _ = read_trajectories(path, load_catalog())
     assert cell.support == scene.support == SCENE.support
-    assert cell == DEFAULT_CELL
+    assert cell == CELL
 
 
 def test_datasets_are_consistent(file: Path) -> None:
@@ -109,7 +115,7 @@ def test_replay_and_plan_only_from_the_command_line(file: Path, tmp_path: Path) 
     assert result.exit_code == 0, result.output
     assert "gelatin_box -> tray" in result.output
     assert (tmp_path / "replay.html").stat().st_size > 100_000
-    save_scene(tmp_path / "scene.yaml", SCENE, DEFAULT_CELL)
+    save_scene(tmp_path / "scene.yaml", SCENE, CELL)
     moves = tmp_path / "moves.yaml"
     moves.write_text("[{pick: gelatin_box, place: tray}, {pick: large_marker, place: tray}]")
     arguments = [
@@ -126,7 +132,7 @@ def test_replay_and_plan_only_from_the_command_line(file: Path, tmp_path: Path) 
     planned, failed = json.loads((tmp_path / "plans" / "plan.json").read_text())["plans"]
     assert planned["planned"]
     assert [segment["name"] for segment in planned["segments"]] == ["approach", "carry", "retreat"]
-    assert planned["segments"][0]["q"][0] == pytest.approx(DEFAULT_CELL.robot.home)
+    assert planned["segments"][0]["q"][0] == pytest.approx(CELL.robot.home)
     assert len(planned["segments"][1]["q"]) == len(planned["segments"][1]["time"])
     assert (failed["planned"], failed["reason"], failed["detail"]) == (
         False,

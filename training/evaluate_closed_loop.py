@@ -27,9 +27,11 @@ from pydantic import BaseModel, model_validator
 
 from drake_clutter.agents.explorers import PRETRAINED_EXPLORERS
 from drake_clutter.catalog import load_catalog
-from drake_clutter.config import upgrade_header_configs
+from drake_clutter.cell.work_cell import load_cell
+from drake_clutter.config import ClutterConfig, upgrade_header_configs
 from drake_clutter.files import InputError, file_sha256
 from drake_clutter.learning.pretrained import checkpoint_path
+from drake_clutter.resources import resource_path
 from drake_clutter.scenes.interfaces import MoveResult
 from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.scenes.scene_dataset import SceneDataset, load_scene_dataset
@@ -71,6 +73,8 @@ EPISODES = RESULTS / "closed_loop"
 """Folder of the published episodes."""
 EPISODES_PER_PROCESS = 10
 """Episodes after which a process is replaced: each keeps some hundred MB, see `map_ordered`."""
+CELL = resource_path("models/cells/ur10_single_cup_tray.yaml")
+"""Cell of the published episodes: its only cup holds no marker."""
 EXCEPTION = "exception"
 """How an episode ended that raised an exception."""
 
@@ -133,6 +137,17 @@ class EpisodeRequest:
     number: int
 
 
+def make_scenario(evaluation: ClosedLoopEvaluation, scenes: SceneDataset, seed: int) -> Scenario:
+    """Return the scenario of an episode."""
+    return Scenario(
+        agent=evaluation.agent,
+        perception=evaluation.perception,
+        objects=scenes.metadata["objects"],
+        seed=seed,
+        world=ClutterConfig(cell=load_cell(CELL)),
+    )
+
+
 class EpisodeRunner:
     """Runs episodes; a worker for `map_ordered`."""
 
@@ -140,19 +155,15 @@ class EpisodeRunner:
         """Load the data that all episodes share."""
         catalog = load_catalog()
         self._load_set = cache(lambda name: load_scene_dataset(SCENES / f"{name}.json", catalog))
-        self._make_policy = cache(lambda agent: make_policy(agent, Scenario().world))
-        self._reachability_bound = ArmReachabilityBound(Scenario().world)
+        world = ClutterConfig(cell=load_cell(CELL))
+        self._make_policy = cache(lambda agent: make_policy(agent, world))
+        self._reachability_bound = ArmReachabilityBound(world)
 
     def __call__(self, request: EpisodeRequest) -> Row:
         """Run an episode and return its record."""
         evaluation, number = request.evaluation, request.number
         scenes: SceneDataset = self._load_set(evaluation.scenes)
-        scenario = Scenario(
-            agent=evaluation.agent,
-            perception=evaluation.perception,
-            objects=scenes.metadata["objects"],
-            seed=number,
-        )
+        scenario = make_scenario(evaluation, scenes, number)
         scene = scenes.settled_scene(number, scenes.grammar, scenario.world)
         start = time.perf_counter()
         record: Row = {
@@ -235,13 +246,7 @@ def collect_episodes(
     networks = [checkpoint_path(evaluation.agent, PRETRAINED_EXPLORERS)]
     if evaluation.perception != "labels":
         networks.append(checkpoint_path(evaluation.perception, PRETRAINED_DETECTORS))
-    scenario = to_plain(
-        Scenario(
-            agent=evaluation.agent,
-            perception=evaluation.perception,
-            objects=scenes.metadata["objects"],
-        )
-    )
+    scenario = to_plain(make_scenario(evaluation, scenes, seed=0))
     scenario.pop("seed")  # Each episode's seed is the number of its scene.
     header = {
         "row": evaluation.name,
