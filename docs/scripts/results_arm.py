@@ -196,7 +196,24 @@ def _grippers() -> str:
         results=["benchmarks/results/gripper_scenes.json"],
     )
     body = [[row["cell"], _fraction(row["solvable"])] for row in results["rows"]]
-    return text + table(["gripper", "solvable"], body)
+    text += table(["gripper", "solvable"], body) + "\n"
+    moves = read_benchmark_results("gripper_moves.json")
+    text += section(
+        "Moves within reach of a gripper",
+        f"Results of planning {moves['count']} random legal moves in stable RG scenes of 25 nodes, "
+        "without simulation.",
+        command=f"python {moves['command']} --out FILE",
+        seed=moves["seed"],
+        results=["benchmarks/results/gripper_moves.json"],
+    )
+    reasons = sorted({reason for row in moves["rows"] for reason in row["results"]})
+    return text + table(
+        ["result", *(row["cell"] for row in moves["rows"])],
+        [
+            [reason, *(str(row["results"].get(reason, 0)) for row in moves["rows"])]
+            for reason in reasons
+        ],
+    )
 
 
 def page() -> str:

@@ -383,7 +383,11 @@ def _rows_schema(record: type[MoveRecord] | type[PoseErrorRecord]) -> Any:
         int: Integer,
         float: Finite | None,
     }
-    columns: dict[str, Any] = {field.name: (types[field.type], ...) for field in fields(record)}
+    columns: dict[str, Any] = {
+        # Parts of studies that were begun with an earlier version have no tool.
+        field.name: (types[field.type], "" if field.name == "tool" else ...)
+        for field in fields(record)
+    }
     row = create_model(record.__name__, __base__=StrictModel, **columns)
     return tuple[row, ...]  # type: ignore[valid-type]
 
