@@ -122,9 +122,9 @@ def test_recorded_episodes_are_not_repeated(
     script, path = training_script("evaluate_closed_loop"), tmp_path / "row.jsonl.gz"
     numbers = list[int]()
 
-    def run(request: Any) -> dict[str, int]:
+    def run(request: Any) -> dict[str, Any]:
         numbers.append(request.number)
-        return {"number": request.number}
+        return {"number": request.number, "arm_can": True, "ended": script.EXCEPTION, "wall": 1.0}
 
     monkeypatch.setattr(results_file, "map_ordered", lambda _, items, **options: map(run, items))
     evaluation = script.EVALUATIONS[0]
