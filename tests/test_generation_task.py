@@ -78,7 +78,7 @@ def test_the_bounds_of_observations() -> None:
         "edge_links": (0, 8),
         "edge_kind": (0, len(vocabulary.edge_kinds)),
         "edge_mask": (0, 1),
-        "remaining_nodes": (0, np.inf),
+        "remaining_nodes": (0, pytest.approx(9 / 25)),
     }
 
 

@@ -322,7 +322,7 @@ def test_the_same_seed_generates_the_same_dataset(
     assert (tmp_path / "one" / TRAIN_FOLDER / "000000").stat().st_mtime_ns == before, (
         "what is there is not made again"
     )
-    with pytest.raises(InputError, match="of another job"):
+    with pytest.raises(InputError, match="results of other options"):
         script.main(tmp_path / "one", count=2, heap_fraction=0.0, seed=4, objects="ycb7")
 
 
