@@ -19,6 +19,25 @@ REASONS = {
 """Wording of the static judge's reasons on the page, by that in results files."""
 
 
+_AGREEMENT_COLUMNS = (
+    "verdicts equal",
+    "false stable",
+    "false unstable",
+    "inconclusive",
+    "hidden lists equal",
+)
+
+
+def _agreement_cells(row: Mapping[str, Any]) -> list[str]:
+    return [
+        estimate(row, "agreement", "agreement_ci95", 3),
+        number(row["false_stable_rate"], 3),
+        number(row["false_unstable_rate"], 3),
+        number(row["inconclusive_fraction"], 3),
+        number(row["hidden_agreement"], 3),
+    ]
+
+
 def _verdict_pair(key: str) -> tuple[str, str]:
     """Return the two verdicts of a key such as "static unstable, Drake stable"."""
     static, drake = key.split(", ")
@@ -38,19 +57,14 @@ def _scenes(results: Mapping[str, Any]) -> str:
         seed=0,
         results=["benchmarks/results/judges.json", "benchmarks/results/drake_verdicts/"],
     )
-    head = ["objects", "nodes", "scenes", "verdicts equal", "false stable", "false unstable"]
     text += table(
-        [*head, "inconclusive", "hidden lists equal"],
+        ["objects", "nodes", "scenes", *_AGREEMENT_COLUMNS],
         [
             [
                 row["objects"],
                 str(row["nodes"]),
                 str(row["count"]),
-                estimate(row, "agreement", "agreement_ci95", 3),
-                number(row["false_stable_rate"], 3),
-                number(row["false_unstable_rate"], 3),
-                number(row["inconclusive_fraction"], 3),
-                number(row["hidden_agreement"], 3),
+                *_agreement_cells(row),
             ]
             for row in results["scenes"]
         ],
@@ -77,19 +91,14 @@ def _meshes() -> str:
         seed=rows[0]["seed"],
         results=["benchmarks/results/mesh_judges.json"],
     )
-    head = ["generator", "nodes", "scenes", "verdicts equal", "false stable", "false unstable"]
     text += table(
-        [*head, "inconclusive", "hidden lists equal"],
+        ["generator", "nodes", "scenes", *_AGREEMENT_COLUMNS],
         [
             [
                 row["agent"],
                 str(row["nodes"]),
                 str(row["count"]),
-                estimate(row, "agreement", "agreement_ci95", 3),
-                number(row["false_stable_rate"], 3),
-                number(row["false_unstable_rate"], 3),
-                number(row["inconclusive_fraction"], 3),
-                number(row["hidden_agreement"], 3),
+                *_agreement_cells(row),
             ]
             for row in rows
         ],
