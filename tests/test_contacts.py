@@ -1,4 +1,4 @@
-"""Contacts between objects: polygons and distances of rectangles and lines, by hand."""
+"""Contacts between objects: polygons and distances of rectangles and lines in closed form."""
 
 from collections.abc import Sequence
 

@@ -139,7 +139,7 @@ def lip_flatness_deviation(
 ) -> float:
     """Return the deviation of the surface under the lip from a plane [m].
 
-    The plane is the one that fits best, at any tilt. Curvature, edges and gaps increase the
+    The plane is a least-squares fit, at any tilt. Curvature, edges and gaps increase the
     deviation; the tilt is that of `lip_tilt`.
 
     Args:

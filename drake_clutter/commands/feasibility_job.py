@@ -384,7 +384,7 @@ def _rows_schema(record: type[MoveRecord] | type[PoseErrorRecord]) -> Any:
         float: Finite | None,
     }
     columns: dict[str, Any] = {
-        # Parts of studies that were begun with an earlier version have no tool.
+        # Parts written by earlier versions have no tool.
         field.name: (types[field.type], "" if field.name == "tool" else ...)
         for field in fields(record)
     }

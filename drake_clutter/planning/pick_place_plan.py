@@ -61,7 +61,7 @@ class PlanningFailure:
 
 
 class FailureLog:
-    """Log of failed attempts that keeps the one that came closest to a plan.
+    """Log of failed attempts; keeps the failure of the latest planning stage.
 
     Attributes:
         furthest: Failure of the attempt that came closest to a plan.
