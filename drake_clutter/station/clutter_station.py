@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import SceneGraph
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains, RigidBody
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
@@ -232,6 +233,11 @@ class ClutterStation(Diagram):
         q = self.joint_positions(context)
         v = self.plant.GetVelocities(context)[self._v_indices]
         return ArmState(tuple(q.tolist()), tuple(v.tolist()), tuple(torque.tolist()), tool)
+
+    def tool_pose_in_object(self, context: Context, tool: str, name: str) -> RigidTransform:
+        """Return X_OG of a tool and an object, by their names, in a context of the plant."""
+        X_TG = self.arm.tools[tool].CalcPoseInWorld(context)
+        return self.scene_plant.bodies[name].EvalPoseInWorld(context).inverse() @ X_TG
 
     def contact_forces(self, context: Context, link: str) -> dict[str, Floats]:
         """Return the sums of the contact forces of objects on a link of the gripper.

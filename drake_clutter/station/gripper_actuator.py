@@ -147,18 +147,15 @@ class SuctionActuator:
             self.status = replace(self.status, release_time=time)
             self._release(context)
 
-    def _cup_pose_in_object(self, context: Context, name: str) -> RigidTransform:
-        """Return X_OG of an object."""
-        X_TG = self._station.arm.tools[self.status.tool].CalcPoseInWorld(context)
-        X_TO = self._station.scene_plant.bodies[name].EvalPoseInWorld(context)
-        return X_TO.inverse() @ X_TG
-
     def _try_attach(self, context: Context) -> None:
         """Attach the object that is closest below the lip, if the lip seals on it."""
         station = self._station
         tool = self.status.tool
         diameter = self._gripper.cup(tool).diameter
-        X_OG = {name: self._cup_pose_in_object(context, name) for name in station.graspable_objects}
+        X_OG = {
+            name: station.tool_pose_in_object(context, tool, name)
+            for name in station.graspable_objects
+        }
         gaps = {
             name: lip_surface_profile(station.object_classes[name], X_OG[name], diameter).min()
             for name in X_OG
@@ -172,7 +169,7 @@ class SuctionActuator:
             self._X_OG = X_OG[closest]
 
     def _release(self, context: Context) -> None:
-        X_OG = self._cup_pose_in_object(context, self.status.held)
+        X_OG = self._station.tool_pose_in_object(context, self.status.tool, self.status.held)
         slip = float(np.linalg.norm(X_OG.translation() - self._X_OG.translation()))
         self._grasp.detach(context)
         self.status = replace(self.status, held="", slip=slip)

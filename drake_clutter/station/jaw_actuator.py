@@ -83,7 +83,7 @@ class JawActuator:
         self._num_missing = 0
         if not self.status.held and touched:
             held = min(touched)
-            self._X_OG = self._tool_pose_in_object(context, held)
+            self._X_OG = self._station.tool_pose_in_object(context, self.status.tool, held)
             self.status = replace(self.status, held=held, last_held=held)
         if self.status.held:
             ratio = max(self._friction_ratio(context, f[self.status.held]) for f in forces)
@@ -96,13 +96,7 @@ class JawActuator:
         x, y, z = frame.CalcPoseInWorld(context).rotation().inverse() @ force
         return float(np.hypot(x, z)) / (self._gripper.friction * max(abs(float(y)), 1e-9))
 
-    def _tool_pose_in_object(self, context: Context, name: str) -> RigidTransform:
-        """Return X_OG of an object."""
-        X_TG = self._station.arm.tools[self.status.tool].CalcPoseInWorld(context)
-        X_TO = self._station.scene_plant.bodies[name].EvalPoseInWorld(context)
-        return X_TO.inverse() @ X_TG
-
     def _release(self, context: Context) -> None:
-        X_OG = self._tool_pose_in_object(context, self.status.held)
+        X_OG = self._station.tool_pose_in_object(context, self.status.tool, self.status.held)
         slip = float(np.linalg.norm(X_OG.translation() - self._X_OG.translation()))
         self.status = replace(self.status, held="", slip=slip)
