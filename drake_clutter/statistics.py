@@ -32,9 +32,9 @@ def wilson_interval(successes: int, count: int) -> tuple[float, float]:
 def mean_interval(values: Sequence[float], low: float, high: float) -> tuple[float, float] | None:
     """Return Gaffke's interval of the mean of a bounded quantity (Gaffke 2005).
 
-    It holds for any number of values and any distribution between the bounds (proof: Vlassis and
-    Thomas 2026, arXiv:2607.08415), where the normal approximation is far too narrow for few values.
-    For values of 0 and 1 it is the interval of Clopper and Pearson (1934).
+    It is conjectured to hold for any number of values and any distribution between the bounds
+    (Learned-Miller and Thomas 2020, arXiv:1905.06208), where the normal approximation is far too
+    narrow for few values. For values of 0 and 1 it is the interval of Clopper and Pearson (1934).
 
     Args:
         values: Independent values from `low` to `high`.
