@@ -8,7 +8,6 @@ import signal
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -77,17 +76,3 @@ def wait_for(condition: Callable[[], Found]) -> Found:
         assert time.monotonic() < deadline
         time.sleep(0.02)
     return found
-
-
-def fail_at(bad: int, item: int) -> int:
-    if item == bad:
-        raise LookupError(f"item {item}")
-    return item
-
-
-def make_failing_worker(bad: int) -> Callable[[int], int]:
-    return partial(fail_at, bad)
-
-
-def broken_factory() -> Callable[[int], int]:
-    raise LookupError("no worker")

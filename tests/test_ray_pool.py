@@ -17,13 +17,12 @@ from pathlib import Path
 import pytest
 import ray
 from conftest import DEFAULT_CELL
+from failing_workers import broken_factory, make_failing_worker
 from ray.cluster_utils import Cluster
 from ray_workers import (
     ItemNumbers,
     RandomNumbers,
-    broken_factory,
     make_environment_reader,
-    make_failing_worker,
     make_sleeper,
     wait_for,
 )

@@ -13,6 +13,7 @@ from multiprocessing import active_children
 from pathlib import Path
 
 import pytest
+from failing_workers import broken_factory, make_failing_worker
 
 from drake_clutter.files import cli_error_handler
 from drake_clutter.seeding import item_rng
@@ -52,20 +53,6 @@ class WorkerCounter:
 
     def __call__(self, item: int) -> int:
         return os.getpid()
-
-
-def fail_at(bad: int, item: int) -> int:
-    if item == bad:
-        raise LookupError(f"item {item}")
-    return item
-
-
-def failing_worker(bad: int) -> Callable[[int], int]:
-    return partial(fail_at, bad)
-
-
-def broken_factory() -> Callable[[int], int]:
-    raise LookupError("no worker")
 
 
 def sleep_or_die(item: float) -> float:
@@ -121,7 +108,7 @@ def test_no_items(workers: int) -> None:
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_an_exception_is_raised_in_the_order_of_items(workers: int) -> None:
-    results = map_ordered(partial(failing_worker, 3), range(10), workers=workers)
+    results = map_ordered(partial(make_failing_worker, 3), range(10), workers=workers)
     assert [next(results) for _ in range(3)] == [0, 1, 2]
     with pytest.raises(LookupError, match="item 3"):
         next(results)
