@@ -73,8 +73,8 @@ EPISODES = RESULTS / "closed_loop"
 """Folder of the published episodes."""
 EPISODES_PER_PROCESS = 10
 """Episodes after which a process is replaced: each keeps some hundred MB, see `map_ordered`."""
-CELL = resource_path("models/cells/ur10_single_cup_tray.yaml")
-"""Cell of the published episodes: its only cup holds no marker."""
+CELLS = {"one_cup": "ur10_single_cup_tray", "two_cups": "ur10_epick_tray"}
+"""Cells of the published episodes. The only cup of the first holds no marker."""
 EXCEPTION = "exception"
 """How an episode ended that raised an exception."""
 
@@ -92,6 +92,7 @@ class ClosedLoopEvaluation:
         agent: See `Scenario`.
         first: Number of the first scene; earlier scenes were used in development.
         count: Number of scenes.
+        cell: Key of `CELLS`.
     """
 
     perception: str
@@ -100,25 +101,29 @@ class ClosedLoopEvaluation:
     agent: str
     first: int
     count: int
+    cell: str
 
     @property
     def name(self) -> str:
-        """Name of the record file."""
+        """Name of the record file; the cell is left out if it has one cup."""
         agent, perception = Path(self.agent).stem, Path(self.perception).stem
-        return f"{self.scenes}_{agent}_{perception}_{self.motion}"
+        name = f"{self.scenes}_{agent}_{perception}_{self.motion}"
+        return name if self.cell == "one_cup" else f"{name}_{self.cell}"
 
 
 EVALUATIONS = [
-    ClosedLoopEvaluation(perception, motion, scenes, agent, first, count)
+    ClosedLoopEvaluation(perception, motion, scenes, agent, first, count, cell)
     for scenes, agent, first, count in (
         ("sg_star_25", "student", 60, 100),
         ("sg_14", "student-14", 50, 50),
     )
-    for perception, motion in (
-        ("depth", "settle"),
-        ("depth-color", "settle"),
-        ("depth", "arm"),
-        ("labels", "arm"),
+    for perception, motion, cell in (
+        ("depth", "settle", "one_cup"),
+        ("depth-color", "settle", "one_cup"),
+        ("depth", "arm", "one_cup"),
+        ("labels", "arm", "one_cup"),
+        ("depth", "arm", "two_cups"),
+        ("labels", "arm", "two_cups"),
     )
 ]
 """Rows of the table."""
@@ -144,8 +149,14 @@ def make_scenario(evaluation: ClosedLoopEvaluation, scenes: SceneDataset, seed: 
         perception=evaluation.perception,
         objects=scenes.metadata["objects"],
         seed=seed,
-        world=ClutterConfig(cell=load_cell(CELL)),
+        world=make_world(evaluation.cell),
     )
+
+
+@cache
+def make_world(cell: str) -> ClutterConfig:
+    """Return the configuration with one of the `CELLS`."""
+    return ClutterConfig(cell=load_cell(resource_path(f"models/cells/{CELLS[cell]}.yaml")))
 
 
 class EpisodeRunner:
@@ -155,9 +166,8 @@ class EpisodeRunner:
         """Load the data that all episodes share."""
         catalog = load_catalog()
         self._load_set = cache(lambda name: load_scene_dataset(SCENES / f"{name}.json", catalog))
-        world = ClutterConfig(cell=load_cell(CELL))
-        self._make_policy = cache(lambda agent: make_policy(agent, world))
-        self._reachability_bound = ArmReachabilityBound(world)
+        self._make_policy = cache(lambda agent, cell: make_policy(agent, make_world(cell)))
+        self._reachability_bound = cache(lambda cell: ArmReachabilityBound(make_world(cell)))
 
     def __call__(self, request: EpisodeRequest) -> Row:
         """Run an episode and return its record."""
@@ -169,10 +179,10 @@ class EpisodeRunner:
         record: Row = {
             "number": number,
             "solvable": scenes.scenes[number].solvable,
-            "arm_can": not self._reachability_bound.find_unrevealable(scene),
+            "arm_can": not self._reachability_bound(evaluation.cell).find_unrevealable(scene),
         }
         try:
-            task, known, robot_time = self._run(scene, scenario, evaluation.motion)
+            task, known, robot_time = self._run(scene, scenario, evaluation)
         except Exception as error:  # Any exception is a result.
             record |= {"ended": EXCEPTION, "exception": repr(error)}
         else:
@@ -184,13 +194,13 @@ class EpisodeRunner:
         return record | {"wall": time.perf_counter() - start}
 
     def _run(
-        self, scene: Scene, scenario: Scenario, motion: str
+        self, scene: Scene, scenario: Scenario, evaluation: ClosedLoopEvaluation
     ) -> tuple[ExplorationTask, tuple[SceneObject, ...], float]:
         """Return the episode, the agent's list of objects, and the robot's time [s]."""
         perceive = make_perception(scenario, scene)
-        policy = self._make_policy(scenario.agent)
+        policy = self._make_policy(evaluation.agent, evaluation.cell)
         backend: ClosedLoop | ImageBackend
-        if motion == "arm":
+        if evaluation.motion == "arm":
             backend = ClosedLoop(
                 scene, perceive=perceive, seed=scenario.seed, config=scenario.world
             )
@@ -377,6 +387,7 @@ def table_row(row: Row) -> dict[str, str]:
         "set": row["scenes"],
         "perception": row["perception"],
         "motion": row["motion"],
+        "cell": row.get("cell", "one_cup"),
         "episodes": str(row["episodes"]),
         "success (95 %)": f"{row['success']:.2f} ({low:.2f}-{high:.2f})",
         "solvable by arm": format_number(row["arm_can"]),

@@ -14,11 +14,12 @@ FAILURES = {
     "what is left lies behind what no cup holds": "remaining objects unreachable by suction"
 }
 """Current wording of reasons in results files of version 0.1."""
-_SETUP = ["dataset", "perception", "motion", "episodes"]
+_SETUP = ["dataset", "perception", "motion", "cups", "episodes"]
 
 
 def _setup(row: dict[str, Any]) -> list[str]:
-    return [row["scenes"], row["perception"], row["motion"], str(row["episodes"])]
+    cups = "" if row["motion"] != "arm" else "2" if row.get("cell") == "two_cups" else "1"
+    return [row["scenes"], row["perception"], row["motion"], cups, str(row["episodes"])]
 
 
 def failures_text(row: dict[str, Any]) -> str:
@@ -36,8 +37,9 @@ def _episodes() -> str:
         "Episodes of at most 20 moves on frozen scenes that neither policy nor detector was "
         "trained on. *Motion*: the arm in the Drake Diagram, or teleported objects settled by "
         "Drake. "
+        "*Cups*: of the tool, one of 25 mm, or another of 6 mm beside it. "
         "*Reachable by suction*: fraction of the scenes in which no object stays hidden behind "
-        "objects that the cup cannot hold. Intervals are 95 %.",
+        "objects that no cup can hold. Intervals are 95 %.",
         command="python training/evaluate_closed_loop.py runs/closed_loop --workers 2",
         seed="number of the scene",
         results=["training/results/closed_loop.json", "training/results/closed_loop/"],
