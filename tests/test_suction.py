@@ -4,6 +4,7 @@
 # mypy: allow-untyped-calls
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,14 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_clutter.assets import build_assets
 from drake_clutter.catalog import ObjectClass, RestOrientation, Shape, load_catalog
-from drake_clutter.cell.gripper import GraspFailure, GraspFailureReason, GraspSampling, Gripper
+from drake_clutter.cell.gripper import (
+    Grasp,
+    GraspFailure,
+    GraspFailureReason,
+    GraspSampling,
+    Gripper,
+    LazyGrasps,
+)
 from drake_clutter.cell.lip_seal import lip_flatness_deviation, lip_surface_profile, lip_tilt
 from drake_clutter.cell.payload_limits import DOWN_G, GRAVITY, payload_wrench
 from drake_clutter.cell.suction import (
@@ -261,6 +269,26 @@ def test_grasps_are_sorted_from_the_center_of_the_top() -> None:
     assert (np.diff(distances) > -1e-9).all()
     assert found[0].payload.mass == box.object_class.mass
     assert found[0].payload.max_acceleration >= found[-1].payload.max_acceleration >= 0.3
+
+
+def test_grasps_are_sampled_once_and_when_they_are_used() -> None:
+    box = resting("cracker_box")
+    found = SUCTION.sample_grasps(box.object_class, rigid_transform(box.X_TO), SAMPLING)
+    assert not isinstance(found, GraspFailure)
+    sampled = list[Grasp]()
+
+    def sample() -> Iterator[Grasp]:
+        for grasp in found:
+            sampled.append(grasp)
+            yield grasp
+
+    grasps = LazyGrasps(sample())
+    assert grasps[0] is found[0]
+    assert len(sampled) == 1
+    assert next(iter(grasps)) is found[0]
+    assert len(sampled) == 1
+    assert grasps[-1] is found[-1]
+    assert list(grasps) == sampled == list(found)
 
 
 def test_reasons_why_there_is_no_grasp() -> None:

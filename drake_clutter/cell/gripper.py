@@ -7,10 +7,11 @@ object, z out of the tool, into the object; O is the object.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol
+from itertools import islice
+from typing import Protocol, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,6 +85,36 @@ class Grasp:
     insertion: float = 0.0
     joints_open: tuple[float, ...] = ()
     joints_held: tuple[float, ...] = ()
+
+
+class LazyGrasps(Sequence[Grasp]):
+    """Grasps that are sampled when they are first used; most plans need only the first."""
+
+    def __init__(self, grasps: Iterator[Grasp]) -> None:
+        """Take the grasps.
+
+        Args:
+            grasps: Samples the grasps.
+        """
+        self._sampled = list[Grasp]()
+        self._rest = grasps
+
+    @overload
+    def __getitem__(self, index: int) -> Grasp: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Grasp]: ...
+    def __getitem__(self, index: int | slice) -> Grasp | Sequence[Grasp]:
+        """Return the grasp of an index, or those of a slice."""
+        if isinstance(index, int) and index >= 0:
+            self._sampled += islice(self._rest, max(0, index + 1 - len(self._sampled)))
+        else:
+            self._sampled += self._rest
+        return self._sampled[index]
+
+    def __len__(self) -> int:
+        """Return the number of grasps, all of which are sampled."""
+        self._sampled += self._rest
+        return len(self._sampled)
 
 
 class GraspFailureReason(Enum):
@@ -167,8 +198,10 @@ class Gripper(Protocol):
         object_class: ObjectClass,
         X_TO: RigidTransform,
         sampling: GraspSampling,
-    ) -> tuple[Grasp, ...] | GraspFailure:
+    ) -> Sequence[Grasp] | GraspFailure:
         """Return feasible grasps of an object, the preferred ones first.
+
+        There is at least one. The others may be sampled when they are first used.
 
         `can_attach` holds at each of them, moved back by `GraspSampling.lip_gap`.
 

@@ -9,7 +9,7 @@ arcs of 14 mm height; size of pads, jaws and palm; friction of the pads.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Literal
 
 import numpy as np
@@ -102,7 +102,7 @@ class ParallelJawGripper(StrictModel):
         object_class: ObjectClass,
         X_TO: RigidTransform,
         sampling: GraspSampling,
-    ) -> tuple[Grasp, ...] | GraspFailure:
+    ) -> Sequence[Grasp] | GraspFailure:
         """Return grasps on two opposed faces from above, see `Gripper`.
 
         Boxes are grasped on two vertical faces, upright cylinders in several directions, lying ones

@@ -11,8 +11,9 @@ the lip uniformly, and the lip opens where tension and bending cancel that load.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from itertools import islice
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -27,6 +28,7 @@ from drake_clutter.cell.gripper import (
     GraspFailure,
     GraspFailureReason,
     GraspSampling,
+    LazyGrasps,
     Payload,
     Tool,
 )
@@ -139,48 +141,57 @@ class SuctionGripper(StrictModel):
         object_class: ObjectClass,
         X_TO: RigidTransform,
         sampling: GraspSampling,
-    ) -> tuple[Grasp, ...] | GraspFailure:
+    ) -> Sequence[Grasp] | GraspFailure:
         """Return grasps on the top at which a lip seals and holds, see `Gripper`.
 
         Those of the first cup come first, and those of a cup in the order of their distances from
         the center of mass.
         """
-        grasps = list[Grasp]()
-        closest_mismatch: _Mismatch | None = (True, math.inf)
-        for cup in self.cups:
-            of_cup, mismatch = self._sample_grasps_of(cup, object_class, X_TO, sampling)
-            grasps += of_cup
-            if closest_mismatch is not None and mismatch is not None:
-                mismatch = min(mismatch, closest_mismatch)
-            closest_mismatch = mismatch
-        if grasps:
-            return tuple(grasps)
-        if closest_mismatch is not None:
-            return GraspFailure(GraspFailureReason.NO_SEAL, closest_mismatch[1])
+        mismatches = {cup.name: (True, math.inf) for cup in self.cups}
+        grasps = LazyGrasps(
+            grasp
+            for cup in self.cups
+            for grasp in islice(
+                self._iterate_grasps(cup, object_class, X_TO, sampling, mismatches),
+                sampling.max_grasps,
+            )
+        )
+        if next(iter(grasps), None):
+            return grasps
+        if len(mismatches) == len(self.cups):
+            return GraspFailure(GraspFailureReason.NO_SEAL, min(mismatches.values())[1])
         return GraspFailure(GraspFailureReason.TOO_HEAVY, object_class.mass)
 
-    def _sample_grasps_of(
+    def _iterate_grasps(
         self,
         cup: SuctionCup,
         object_class: ObjectClass,
         X_TO: RigidTransform,
         sampling: GraspSampling,
-    ) -> tuple[list[Grasp], _Mismatch | None]:
-        """Return the grasps of a cup, and the closest mismatch; None if the cup seals somewhere."""
-        grasps = list[Grasp]()
+        mismatches: dict[str, _Mismatch],
+    ) -> Iterator[Grasp]:
+        """Yield the grasps of a cup.
+
+        Args:
+            cup: The cup.
+            object_class: Class of the object.
+            X_TO: Pose of the object.
+            sampling: Parameters of the sampling.
+            mismatches: Closest mismatch of each cup by its name, which is updated; that of a cup
+                that seals is removed.
+        """
         p_TCm = X_TO @ object_class.center_of_mass
-        closest_mismatch: _Mismatch = (True, math.inf)
-        has_seal = False
         for X_TG in top_poses(object_class, X_TO, cup.diameter, sampling.spacing):
             X_OG = X_TO.InvertAndCompose(X_TG)
             profile = lip_surface_profile(object_class, X_OG, cup.diameter) + sampling.lip_gap
             if not self._seals(profile, cup.diameter):
-                deviation = profile_deviation(profile, cup.diameter)
-                is_uneven = deviation > self.unevenness
-                value = deviation if is_uneven else float(profile.min())
-                closest_mismatch = min(closest_mismatch, (is_uneven, value))
+                if cup.name in mismatches:
+                    deviation = profile_deviation(profile, cup.diameter)
+                    is_uneven = deviation > self.unevenness
+                    value = deviation if is_uneven else float(profile.min())
+                    mismatches[cup.name] = min(mismatches[cup.name], (is_uneven, value))
                 continue
-            has_seal = True
+            mismatches.pop(cup.name, None)
             p_GCm = X_TG.inverse() @ p_TCm
             down_G = -X_TG.rotation().matrix()[2]
             acceleration = self.max_acceleration(cup.name, object_class.mass, p_GCm, down_G)
@@ -189,10 +200,7 @@ class SuctionGripper(StrictModel):
                 p_GCm = (0.0, 0.0, round(float(p_GCm[2]), 2))
                 a, b, c = (cup.X_FG.transform @ np.array(p_GCm)).tolist()
                 payload = Payload(object_class.mass, (a, b, c), acceleration)
-                grasps.append(Grasp(cup.name, X_TG, payload))
-                if len(grasps) == sampling.max_grasps:
-                    break
-        return grasps, None if has_seal else closest_mismatch
+                yield Grasp(cup.name, X_TG, payload)
 
     def can_attach(self, tool: str, object_class: ObjectClass, X_OG: RigidTransform) -> bool:
         """Return whether the lip seals on the surface at a pose, see `Gripper`."""

@@ -166,7 +166,7 @@ class PickPlacePlanner:
         """
         return not objects_resting_on(scene_object, objects) and self.can_grasp(scene_object)
 
-    def _find_grasps(self, picked: SceneObject) -> tuple[Grasp, ...] | PlanningFailure:
+    def _find_grasps(self, picked: SceneObject) -> Sequence[Grasp] | PlanningFailure:
         """Return the feasible grasps of an object, closest to its center of mass first."""
         object_class = picked.object_class
         config = self.config
