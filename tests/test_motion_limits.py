@@ -26,7 +26,7 @@ def test_no_limit_is_exceeded(robot: str) -> None:
         planner = PickPlacePlanner(cell, PlannerConfig(optimize=number == 0))
         angle = math.pi * number / NUM_MOVES
         x, y = 0.12 * math.cos(angle), 0.12 * math.sin(angle)
-        z = can.X_TO.translation[2] + generator.uniform(0.0005, 0.05)
+        z = can.X_TO.translation[2] + generator.uniform(0.0005, 0.005)
         plan = planner.plan([can], can.name, Pose((x, y, z), can.X_TO.quaternion))
         assert isinstance(plan, PickPlacePlan), plan
         for segment in plan.segments:

@@ -80,8 +80,11 @@ def test_gripper_and_object_reach_their_target_poses(plan: PickPlacePlan) -> Non
         assert pytest.approx(expected, abs=1e-6) == X_TG
 
 
-def assert_collision_free(plan: PickPlacePlan, objects: list[SceneObject]) -> None:
-    """Assert that a plan has no collisions, at samples three times as dense as the planner's."""
+def assert_collision_free(plan: PickPlacePlan, objects: list[SceneObject], *supports: str) -> None:
+    """Assert that a plan has no collisions, at samples three times as dense as the planner's.
+
+    The picked object may touch the floor and what it is placed on.
+    """
     scene = planner().collision_model(objects)
     for phase in plan.segments:
         scene.set_object_poses(objects)
@@ -94,7 +97,7 @@ def assert_collision_free(plan: PickPlacePlan, objects: list[SceneObject]) -> No
         least = own = math.inf
         for time in np.linspace(0.0, phase.duration, 300):
             for here in scene.distances_below(phase.trajectory.value(time).ravel(), 0.03):
-                if here.pair == (plan.pick, "floor"):
+                if here.pair[0] == plan.pick and here.pair[1] in ("floor", *supports):
                     assert here.distance > -0.001
                 elif here.pair == (f"{plan.tool}_cup", plan.pick):
                     assert here.distance > -0.0005, (
@@ -166,7 +169,7 @@ def test_poses_may_be_out_of_reach() -> None:
         "unreachable: the grasp",
     )
     nearer = cell_with("robot.base.x=-1.15")
-    found = planner(nearer).plan(PILE, "cracker_box", place_pose(PILE[2], 0.3, -0.3))
+    found = planner(nearer).plan(PILE, "cracker_box", place_pose(PILE[2], 0.26, -0.3))
     assert (reason(found), str(found)) == (
         PlanningFailureReason.UNREACHABLE,
         "unreachable: the place",
@@ -197,19 +200,22 @@ def test_planning_may_time_out() -> None:
 
 
 def test_moves_with_reachable_endpoints_are_planned() -> None:
-    """Objects of random scenes are placed in free space above the scene."""
+    """Objects of random scenes are placed at random on the tray and on a high box."""
     num_planned = 0
     generator = rng(0)
+    here = planner(config=PlannerConfig(optimize=False))
     for seed in range(3):
         scene = random_scene(seed, 12, 12)
-        for o in scene.objects:
-            x, y = generator.uniform(-0.2, 0.2, 2)
-            place = Pose((x, y, o.X_TO.translation[2] + 0.5), o.X_TO.quaternion)
-            if planner().are_endpoints_reachable(scene.objects, o.name, place):
+        tower = resting("cracker_box", Orientation.UPRIGHT_0, (-0.28, 0.0), name="tower")
+        objects = [*scene.objects, tower]
+        for k, o in enumerate(scene.objects):
+            x, y = generator.uniform(-0.25, 0.25, 2)
+            x, y, floor = (-0.28, 0.0, tower.top_height) if k % 4 == 0 else (x, y, 0.0)
+            height = float(o.X_TO.p[2] - o.bounds_T[0][2])
+            place = Pose((x, y, floor + height + 0.001), o.X_TO.quaternion)
+            if here.are_endpoints_reachable(objects, o.name, place):
                 num_planned += 1
-                assert isinstance(planner().plan(scene.objects, o.name, place), PickPlacePlan), (
-                    o.name
-                )
+                assert isinstance(here.plan(objects, o.name, place), PickPlacePlan), o.name
     assert num_planned >= 5
 
 
@@ -267,13 +273,19 @@ def test_optimized_trajectories_are_faster(plan: PickPlacePlan) -> None:
 
 def test_the_arm_retracts_from_a_high_place_pose_before_moving_home() -> None:
     """A straight joint-space path home would pass through the placed box."""
-    box = resting("pudding_box", Orientation.FLAT_0)
-    for height in (0.2, 0.35, 0.5):
-        high = Pose((0.1, 0.0, height), box.X_TO.quaternion)
+    box = resting("pudding_box", Orientation.FLAT_0, (-0.15, 0.0))
+    tower = [
+        resting("sugar_box", Orientation.UPRIGHT_0, (0.1, 0.0), 0.0, "lower"),
+        resting("sugar_box", Orientation.UPRIGHT_0, (0.1, 0.0), 0.175, "middle"),
+        resting("sugar_box", Orientation.UPRIGHT_0, (0.1, 0.0), 0.350, "upper"),
+    ]
+    for levels in (1, 2, 3):
+        objects = [box, *tower[:levels]]
+        high = box.X_TO.translated((0.25, 0.0, 0.175 * levels + 0.001))
         for optimize in (False, True):
-            found = planner(config=PlannerConfig(optimize=optimize)).plan([box], box.name, high)
+            found = planner(config=PlannerConfig(optimize=optimize)).plan(objects, box.name, high)
             assert isinstance(found, PickPlacePlan)
-            assert_collision_free(found, [box])
+            assert_collision_free(found, objects, objects[-1].name)
 
 
 def test_results_files_with_earlier_names_load() -> None:

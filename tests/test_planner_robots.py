@@ -189,5 +189,5 @@ def test_fixtures_of_the_cell_are_avoided() -> None:
     there = PickPlacePlanner(with_wall((0.20, -0.25, 0.3), (0.1, 0.1, 0.6)), PlannerConfig())
     found = there.plan([box], box.name, X_TO)
     assert isinstance(found, PlanningFailure)
-    assert found.reason is PlanningFailureReason.IN_COLLISION
+    assert found.reason is PlanningFailureReason.PLACE_IN_COLLISION
     assert "wall" in found.detail

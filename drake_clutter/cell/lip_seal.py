@@ -51,7 +51,7 @@ def _grid_points(lower: Floats, upper: Floats, target: Floats, spacing: float) -
 
 
 @lru_cache(maxsize=256)
-def _piece_half_spaces(object_class: ObjectClass) -> tuple[Floats, ...]:
+def piece_half_spaces(object_class: ObjectClass) -> tuple[Floats, ...]:
     """Return rows (n, d) of n . p + d <= 0 inside of each convex piece. Shapes (F, 4)."""
     return tuple(np.asarray(ConvexHull(piece).equations) for piece in object_class.convex_pieces)
 
@@ -79,7 +79,7 @@ def _piece_depths(object_class: ObjectClass, X_OG: RigidTransform, points: Float
     direction = R_OG[:, 2]
     depth = np.full(len(points), np.inf)
     # Intersect each ray with the half-spaces of each convex piece.
-    for half_spaces in _piece_half_spaces(object_class):
+    for half_spaces in piece_half_spaces(object_class):
         slope = half_spaces[:, :3] @ direction
         offset = starts @ half_spaces[:, :3].T + half_spaces[:, 3]
         with np.errstate(divide="ignore", invalid="ignore"):

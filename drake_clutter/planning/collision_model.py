@@ -22,7 +22,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.planning.shape_table import FoundDistances, ShapeTable
+from drake_clutter.planning.shape_table import FoundDistances, ShapeTable, hull_corners
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.occlusion import OccludedBox
 from drake_clutter.scenes.scene import Pose, SceneObject
@@ -35,6 +35,9 @@ from drake_clutter.simulation.cell_plant import (
 from drake_clutter.simulation.scene_plant import add_scene_plant, get_support_body, rigid_transform
 
 Floats = NDArray[np.float64]
+
+_OCCLUDED_PREFIX = "unseen_"
+"""Prefix of the geometries of occluded volumes."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,8 @@ class CollisionModel:
         plant: Plant of arm, cell and objects.
         arm_names: Names of the bodies of robot and gripper.
         fixture_tops: Height of the highest point of each fixture [m].
+        fixed_corners: Corners of the convex hull of each fixed geometry that is not an occluded
+            volume, in T [m]. Shapes (V, 3).
     """
 
     def __init__(
@@ -98,7 +103,7 @@ class CollisionModel:
                 plant.world_body(),
                 X_TB,
                 Box(*box.size),
-                f"unseen_{k}",
+                f"{_OCCLUDED_PREFIX}{k}",
                 CoulombFriction(1.0, 1.0),
             )
         plant.Finalize()
@@ -155,8 +160,20 @@ class CollisionModel:
             ]
             for name, body in self._bodies.items()
         }
+        self.fixed_corners = tuple(
+            query.GetPoseInWorld(self._geometry_ids[shape]).multiply(corners.T).T
+            for body in self._fixed
+            for shape in shapes_of(body)
+            if not self._shape_names[shape].startswith(_OCCLUDED_PREFIX)
+            and len(corners := hull_corners(inspector, self._geometry_ids[shape]))
+        )
         obstacles = (*self._fixed, *self._bodies.values())
         self._obstacle_shapes = [shape for body in obstacles for shape in shapes_of(body)]
+        self._solid_shapes = [
+            shape
+            for shape in self._obstacle_shapes
+            if not self._shape_names[shape].startswith(_OCCLUDED_PREFIX)
+        ]
         self._gripper_shapes = [
             shape
             for body in self._arm.bodies
@@ -302,7 +319,7 @@ class CollisionModel:
         Returns:
             Pairs of the row of the path and a distance, in the order of the path.
         """
-        found = self._find_distances(path, max_distance, with_gradients=False)
+        found = self._find_distances(path, max_distance, self._active_pairs, with_gradients=False)
         return list(zip(found.rows.tolist(), self._to_signed_distances(found), strict=True))
 
     def distances_and_gradients_along(
@@ -318,7 +335,7 @@ class CollisionModel:
             Rows of the path, shape (k,), k distances, and their derivatives by the joint positions
             [m/rad], shape (k, n).
         """
-        found = self._find_distances(path, max_distance, with_gradients=True)
+        found = self._find_distances(path, max_distance, self._active_pairs, with_gradients=True)
         return found.rows, self._to_signed_distances(found), found.gradients
 
     def distances_below(self, q: Floats, max_distance: float) -> list[SignedDistance]:
@@ -346,6 +363,22 @@ class CollisionModel:
         _, distances, gradients = self.distances_and_gradients_along(q[None], max_distance)
         return list(zip(distances, gradients, strict=True))
 
+    def object_distances(self, name: str, max_distance: float) -> list[SignedDistance]:
+        """Return the signed distances of an object to solids below a threshold.
+
+        Solids are all other objects and what is fixed, without occluded volumes.
+
+        Args:
+            name: Name of the object, which is not attached.
+            max_distance: Threshold, not negative [m].
+        """
+        shapes = [shape for shape, _ in self._object_shapes[name]]
+        others = [shape for shape in self._solid_shapes if shape not in shapes]
+        pairs = np.array([(shape, other) for shape in shapes for other in others], np.int64)
+        q = np.zeros((1, len(self._q_indices)))
+        found = self._find_distances(q, max_distance, pairs, with_gradients=False)
+        return self._to_signed_distances(found)
+
     def _to_signed_distances(self, found: FoundDistances) -> list[SignedDistance]:
         names = self._shape_names
         pairs = found.pairs.tolist()
@@ -354,12 +387,14 @@ class CollisionModel:
             for distance, (first, second) in zip(found.distances.tolist(), pairs, strict=True)
         ]
 
+    @property
+    def _active_pairs(self) -> NDArray[np.int64]:
+        """Pairs of shapes whose distances are computed. Shape (p, 2)."""
+        return self._pairs if self._attached is None else self._attached_pairs(self._attached.name)
+
     def _find_distances(
-        self, path: Floats, max_distance: float, *, with_gradients: bool
+        self, path: Floats, max_distance: float, pairs: NDArray[np.int64], *, with_gradients: bool
     ) -> FoundDistances:
-        pairs = self._pairs
-        if self._attached is not None:
-            pairs = self._attached_pairs(self._attached.name)
         found = self._shapes.find_distances(
             path, pairs, max_distance, with_gradients=with_gradients
         )

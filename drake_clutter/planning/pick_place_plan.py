@@ -32,6 +32,10 @@ class PlanningFailureReason(Enum):
     NO_OPPOSED_FACES = "no opposed faces"
     TOO_HEAVY = "too heavy"
     CARRIES_OTHERS = "carries others"
+    PLACE_IN_COLLISION = "place in collision"
+    PLACE_TILTED = "place tilted"
+    PLACE_UNSUPPORTED = "place without support"
+    PLACE_OFF_BALANCE = "place off balance"
     UNREACHABLE = "unreachable"
     IN_COLLISION = "in collision"
     TRAJECTORY_INFEASIBLE = "trajectory infeasible"
@@ -47,7 +51,9 @@ class PlanningFailure:
         detail: Names of the colliding geometries, of the objects on top, or of the pose that is
             out of reach.
         value: Quantity that the reason refers to: flatness deviation of the surface under the best
-            grasp [m], mass [kg], signed distance [m], tilt [rad] or time [s]. NaN if there is none.
+            grasp [m], mass [kg], signed distance [m], tilt [rad] or time [s]; of a place pose the
+            depth of penetration [m], the tilt [rad], the gap to what is below [m] or the distance
+            of the center of mass from the contact area [m]. NaN if there is none.
         planning_time: Wall time spent [s].
     """
 

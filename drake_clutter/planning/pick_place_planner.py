@@ -10,6 +10,7 @@ from functools import lru_cache
 
 from drake_clutter.cell.gripper import Grasp, GraspFailure, GraspSampling, Gripper
 from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.files import InputError, format_value
 from drake_clutter.planning.collision_model import CollisionModel
 from drake_clutter.planning.pick_place_plan import (
     PickPlacePlan,
@@ -17,6 +18,7 @@ from drake_clutter.planning.pick_place_plan import (
     PlanningFailureReason,
 )
 from drake_clutter.planning.pick_place_search import PickPlaceSearch
+from drake_clutter.planning.place_check import check_place
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.robots.robot_model import load_robot
@@ -24,6 +26,19 @@ from drake_clutter.scenes.geometry import objects_resting_on
 from drake_clutter.scenes.occlusion import OccludedBox
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.scene_plant import rigid_transform
+
+
+def find_object(objects: Sequence[SceneObject], name: str) -> SceneObject:
+    """Return the object with a name.
+
+    Raises:
+        InputError: No object has the name.
+    """
+    for o in objects:
+        if o.name == name:
+            return o
+    names = ", ".join(o.name for o in objects) or "an object; none is known"
+    raise InputError(f"pick: {format_value(name)} is not a known object; expected {names}")
 
 
 class PickPlacePlanner:
@@ -88,9 +103,15 @@ class PickPlacePlanner:
             pick: Name of the picked object.
             X_TO_place: Pose at which the object is released.
             occluded: Occluded volumes, which count as obstacles.
+
+        Returns:
+            The plan, or the reason why there is none.
+
+        Raises:
+            InputError: No object has the name.
         """
         start_time = time.perf_counter()
-        picked = next(o for o in objects if o.name == pick)
+        picked = find_object(objects, pick)
         # Try the offset first, then the place pose itself; only once if the offset is 0.
         for offset in dict.fromkeys((self.config.descent_start_offset, 0.0)):
             X_TO_start = X_TO_place.translated((0.0, 0.0, offset))
@@ -122,6 +143,8 @@ class PickPlacePlanner:
                 f"at home: {' and '.join(nearest.pair)}",
                 nearest.distance,
             )
+        if failure := self._check_place(model, objects, picked, X_TO_place):
+            return failure
         tops = [*model.fixture_tops, *(box.top_height for box in occluded)]
         search = self._search(model, objects, picked, X_TO_place, tops)
         for grasp in grasps:
@@ -138,6 +161,18 @@ class PickPlacePlanner:
                 if plan is not None:
                     return plan
         return search.failures.furthest
+
+    def _check_place(
+        self,
+        model: CollisionModel,
+        objects: Sequence[SceneObject],
+        picked: SceneObject,
+        X_TO_place: Pose,
+    ) -> PlanningFailure | None:
+        """Return why the object cannot be released at a pose, see `check_place`."""
+        others = [o for o in objects if o is not picked]
+        placed = replace(picked, X_TO=X_TO_place)
+        return check_place(placed, others, model, self.config.max_guarded_descent)
 
     def _search(
         self,
@@ -196,10 +231,12 @@ class PickPlacePlanner:
             pick: Name of the picked object.
             X_TO_place: Pose at which the object is released.
         """
-        picked = next(o for o in objects if o.name == pick)
+        picked = find_object(objects, pick)
         grasps = self._grasps(picked)
         if objects_resting_on(picked, objects) or isinstance(grasps, PlanningFailure):
             return False
         model = self.collision_model(objects)
+        if self._check_place(model, objects, picked, X_TO_place) is not None:
+            return False
         search = self._search(model, objects, picked, X_TO_place)
         return any(search.has_candidate(grasp) for grasp in grasps)

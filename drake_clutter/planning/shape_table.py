@@ -55,6 +55,26 @@ def _core_of(inspector: SceneGraphInspector, geometry: GeometryId) -> _Core:
     return _Core(CoreKind.OTHER)
 
 
+def hull_corners(inspector: SceneGraphInspector, geometry: GeometryId) -> Floats:
+    """Return the corners of a geometry's convex hull in its own frame [m].
+
+    A cylinder is represented by an inscribed prism of 32 sides. Rounded shapes have no corners.
+
+    Returns:
+        Corners. Shape (V, 3).
+    """
+    core = _core_of(inspector, geometry)
+    if core.kind is CoreKind.BOX:
+        signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(-1, 3)
+        return np.asarray(signs * core.size)
+    if core.kind is CoreKind.CYLINDER:
+        angle = np.arange(32) * (np.pi / 16)
+        x, y = core.size[0] * np.array([np.cos(angle), np.sin(angle)])
+        ends = [np.column_stack([x, y, np.full(32, z)]) for z in (-core.size[2], core.size[2])]
+        return np.vstack(ends)
+    return np.zeros((0, 3)) if core.vertices is None else core.vertices
+
+
 @dataclass(frozen=True)
 class FoundDistances:
     """Distances below a threshold along a path.
