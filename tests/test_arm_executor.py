@@ -76,6 +76,7 @@ def test_an_object_is_placed_at_its_place_pose(plan: PickPlacePlan) -> None:
     assert max(result.displacements.values()) < 0.001
     assert result.max_tracking_error < 0.02
     assert 0.1 < result.max_load_ratio < 1
+    assert result.lowered_distance == 0.0, "without a guarded descent"
 
 
 def test_a_weld_grasp_does_not_slip(plan: PickPlacePlan) -> None:
@@ -129,6 +130,22 @@ def test_an_object_that_comes_off_at_its_place_pose_is_placed(
     after = SCENE.with_poses({"sugar_box": Pose((*xy, 0.0875), PLACE.quaternion)})
     outcome = evaluate_outcome(SCENE, after, "sugar_box", PLACE, True, config.settle)
     assert (outcome.result, outcome.instability) == (result, None)
+
+
+def test_only_disturbed_objects_are_settled(config: ClutterConfig) -> None:
+    """Every object is in the air: the picked one, one that the motion moved, and one it did not."""
+    in_the_air = scene_of(
+        *(replace(o, X_TO=o.X_TO.translated((0.0, 0.0, 0.001))) for o in SCENE.objects)
+    )
+    can, untouched = "tomato_soup_can", "pudding_box"
+    X_TO_moved = in_the_air[can].X_TO.translated((0.0, 0.001, 0.0))
+    after = in_the_air.with_poses({"sugar_box": PLACE, can: X_TO_moved})
+    outcome = evaluate_outcome(in_the_air, after, "sugar_box", PLACE, False, config.settle)
+    assert (outcome.result, outcome.instability) == (MoveResult.PLACED, None)
+    for name in ("sugar_box", can):
+        fall = after[name].X_TO.p - outcome.scene[name].X_TO.p
+        assert fall == pytest.approx([0.0, 0.0, 0.001], abs=2e-4)
+    assert outcome.scene[untouched].X_TO == after[untouched].X_TO
 
 
 def test_stages_of_the_command_schedule(plan: PickPlacePlan) -> None:

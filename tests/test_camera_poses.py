@@ -314,6 +314,23 @@ def test_space_behind_known_objects_is_occluded(tilted: LabelDetector) -> None:
     assert all(block.center[1] > 0.03 for block in blocks)
 
 
+def test_occluded_boxes_are_as_high_as_the_shadow(tilted: LabelDetector) -> None:
+    """The shadow ends at the line from the camera over the upper edge of the wall.
+
+    The boxes have the height of the shadow at their near side, rounded up to the 10 mm of the grid.
+    """
+    wall = resting("cracker_box", Orientation.UPRIGHT_0, name="wall")
+    empty = tilted.perceive(scene_of()).observation.depth
+    blocks = occluded_boxes([wall], tilted.perceive(scene_of(wall)).observation, empty)
+    (x, far, top), (_, y_TC, z_TC) = wall.corners_T.max(axis=0), CAMERA.X_TC.translation()
+    slope = (top - z_TC) / (far - y_TC)
+    behind = [block for block in blocks if abs(block.center[0]) < x - 0.03]
+    assert len({block.top_height for block in behind}) == 3
+    for block in behind:
+        shadow = top + slope * (block.center[1] - block.size[1] / 2 - far)
+        assert shadow <= block.top_height <= min(shadow + 0.01, top)
+
+
 def test_unidentified_flat_objects_are_seen_by_a_tilted_camera(tilted: LabelDetector) -> None:
     """An unidentified object of 28 mm gives an occluded box; floor and rim give none."""
     empty = tilted.perceive(scene_of()).observation.depth

@@ -164,6 +164,25 @@ def test_a_missed_object_with_unchanged_depth_is_restored() -> None:
     ].mask.sum()
 
 
+@pytest.mark.parametrize(("excess", "is_restored"), [(0, True), (1, False)])
+def test_a_missed_object_is_restored_if_at_most_half_its_pixels_belong_to_detections(
+    excess: int, is_restored: bool
+) -> None:
+    box = resting("sugar_box", xy=(0.0, 0.1), name="sugar_box_1")
+    observed = replace(LabelDetector(CAMERA).perceive(scene_of(box)).observation, detections=())
+    (restored,) = associate_detections([box], observed).observation.detections
+    pixels = np.flatnonzero(restored.mask)
+    assert len(pixels) % 2 == 0
+    mask = np.zeros(observed.depth.shape, bool)
+    mask.ravel()[pixels[: len(pixels) // 2 + excess]] = True
+    other = Detection("can", CLASSES[CAN], Pose((0.2, -0.2, 0.05)), mask, is_confident=True)
+    found = associate_detections([box], replace(observed, detections=(other,))).observation
+    masks = {d.name: d.mask for d in found.detections}
+    assert masks.keys() == {f"{CAN}_1", *(["sugar_box_1"] if is_restored else [])}
+    if is_restored:
+        assert (masks["sugar_box_1"] == restored.mask & ~mask).all()
+
+
 def test_an_object_out_of_view_that_penetrates_a_detection_is_lost() -> None:
     known, observed, _ = side_by_side()
     ghost = resting("gelatin_box", xy=known[0].X_TO.translation[:2], name="gelatin_box_1")

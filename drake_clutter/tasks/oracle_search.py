@@ -157,7 +157,7 @@ class OracleSearch:
         self._invalid_first_moves = invalid_moves
         self._on_evaluation = on_evaluation
         self._remaining_budget = budget
-        self._num_inconclusive = 0
+        self._has_inconclusive_verdict = False
         rng_state = (rng or item_rng(seed)).bit_generator.state
         start = self._make_state(scene, frozenset(known), rng_state)
         immovable = self._judge.immovable_objects(scene)
@@ -185,12 +185,12 @@ class OracleSearch:
             while not is_exhausted and lower_bound < (
                 len(plan) if plan is not None else MAX_PLAN_LENGTH + 1
             ):
-                self._num_inconclusive = 0
+                self._has_inconclusive_verdict = False
                 shorter = self._depth_limited_search(start, lower_bound, only_blockers=False)
                 if shorter is not None:
                     plan = shorter
                     break
-                if self._num_inconclusive:
+                if self._has_inconclusive_verdict:
                     break  # A move with an inconclusive verdict might begin a shorter plan.
                 is_exhausted = not self._limit_reached and plan is None
                 lower_bound += not is_exhausted
@@ -344,7 +344,7 @@ class OracleSearch:
         unsupported = {
             name: self._judge.objects_losing_support(state.scene, name) for name in in_view
         }
-        self._num_inconclusive += sum(
+        self._has_inconclusive_verdict |= any(
             isinstance(names, InconclusiveVerdict) for names in unsupported.values()
         )
         movable = [name for name, names in unsupported.items() if names == ()]
@@ -367,7 +367,7 @@ class OracleSearch:
         if command is None:
             return None
         outcome = self._executor.execute(state.scene, command, rng)
-        self._num_inconclusive += outcome.result is MoveResult.INCONCLUSIVE
+        self._has_inconclusive_verdict |= outcome.result is MoveResult.INCONCLUSIVE
         if outcome.result is not MoveResult.PLACED:
             return None
         return self._make_state(outcome.scene, state.known, rng.bit_generator.state)
