@@ -27,6 +27,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.files import write_json
 from drake_clutter.grammar import NodeBudget, SceneGrammar, uniform_choice
 from drake_clutter.planning.arm_dynamics import dynamics_plant
+from drake_clutter.planning.cubic_spline import CubicSpline
 from drake_clutter.planning.motion_limits import MotionLimits
 from drake_clutter.planning.pick_place_plan import (
     PickPlacePlan,
@@ -177,7 +178,7 @@ def time_optimal_duration(cell: WorkCell, plan: PickPlacePlan, segment: Trajecto
     s = np.linspace(0.0, length[-1], _NUM_PATH_POINTS)
     points = np.column_stack([np.interp(s, length, joint) for joint in q.T])
     path = make_interp_spline(s / length[-1], points, k=3)
-    problem = path_speed_problem(path, MotionLimits(unlimited, payload))
+    problem = path_speed_problem(CubicSpline(path.t, path.c), MotionLimits(unlimited, payload))
     speeds = problem.time_optimal_speeds()
     return float((2 * np.diff(problem.grid) / (speeds[1:] + speeds[:-1])).sum())
 

@@ -29,6 +29,7 @@ from drake_clutter.cell.work_cell import default_cell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import write_json
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.planning.cubic_spline import CubicSpline
 from drake_clutter.planning.motion_limits import MotionLimits
 from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
 from drake_clutter.planning.planner_config import PlannerConfig
@@ -388,7 +389,7 @@ def timing(
             stopwatch.seconds["sure plan"].pop()
             stopwatch.seconds["optimised plan"].pop()
             return False
-        q = sample_path(plan.segments[1].trajectory)
+        q = sample_path(CubicSpline.from_trajectory(plan.segments[1].trajectory))
         tool = planner.tools[plan.tool]
         poses = tool.pose(q)
         stopwatch.measure(

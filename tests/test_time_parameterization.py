@@ -5,19 +5,18 @@ import math
 import numpy as np
 import pytest
 from conftest import DEFAULT_CELL, cell_with, rng
-from pydrake.math import BsplineBasis, KnotVectorType
 from pydrake.multibody.optimization import Toppra
 from pydrake.trajectories import BsplineTrajectory, Trajectory
 
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.arm_dynamics import arm_dynamics, dynamics_plant
+from drake_clutter.planning.cubic_spline import CubicSpline, clamped_knots, uniform_spline
 from drake_clutter.planning.motion_limits import (
     LimitKind,
     LimitViolation,
     MotionLimits,
     scale_to_limits,
-    to_scipy,
 )
 from drake_clutter.planning.time_parameterization import (
     SMOOTHING_TIME,
@@ -63,6 +62,22 @@ def test_a_bspline_path_keeps_its_ends_and_blends_corners() -> None:
     assert 0.005 < aside.min() < 0.08
 
 
+def test_splines_equal_those_of_drake() -> None:
+    generator = rng(3)
+    points = generator.uniform(-1.0, 1.0, (9, 6))
+    for spline in (CubicSpline(0.7 * clamped_knots(9), points), uniform_spline(points, 0.005)):
+        trajectory = spline.to_trajectory()
+        times = np.linspace(spline.start_time, spline.end_time, 101)
+        samples = spline.sample(times)
+        for order, found in enumerate((samples.q, samples.v, samples.a, samples.jerk)):
+            expected = trajectory.MakeDerivative(order).vector_values(times).T
+            assert found == pytest.approx(expected, rel=1e-9, abs=1e-9)
+        assert (spline.values(times) == samples.q).all()
+        copied = CubicSpline.from_trajectory(trajectory)
+        assert (copied.knots == spline.knots).all()
+        assert (copied.points == points).all()
+
+
 def limit_ratios(
     trajectory: Trajectory, payload: Payload, cell: WorkCell = ARM
 ) -> dict[str, float]:
@@ -93,18 +108,16 @@ def limit_ratios(
     return {name: float(np.abs(share).max()) for name, share in pairs.items()}
 
 
-def corner_path(generator: np.random.Generator) -> BsplineTrajectory:
+def corner_path(generator: np.random.Generator) -> CubicSpline:
     """Return a path with a corner."""
     via, end = (HOME + generator.uniform(-0.8, 0.8, 6) for _ in range(2))
     return bspline_path(np.vstack([linear_joint_path(HOME, via), linear_joint_path(via, end)[1:]]))
 
 
-def parameterize(
-    path: BsplineTrajectory, payload: Payload, cell: WorkCell = ARM
-) -> BsplineTrajectory:
+def parameterize(path: CubicSpline, payload: Payload, cell: WorkCell = ARM) -> BsplineTrajectory:
     trajectory = parameterize_time_optimal(path, MotionLimits(cell, payload))
-    assert isinstance(trajectory, BsplineTrajectory), str(trajectory)
-    return trajectory
+    assert isinstance(trajectory, CubicSpline), str(trajectory)
+    return trajectory.to_trajectory()
 
 
 LOADED = Payload(0.5, (0.0, 0.0, 0.3223), 1.5)
@@ -130,11 +143,12 @@ def test_trajectories_satisfy_the_limits(cell: WorkCell, payload: Payload, activ
         assert max(ratios.values()) < 1.002, ratios
         assert not active or ratios[active] > 0.7, ratios
         for time, s in ((0.0, 0.0), (trajectory.end_time(), 1.0)):
-            assert trajectory.value(time) == pytest.approx(path.value(s), abs=1e-12)
+            (q,) = path.values(np.array([s]))
+            assert trajectory.value(time).ravel() == pytest.approx(q, abs=1e-12)
             for order in (1, 2):
                 assert np.abs(trajectory.EvalDerivative(time, order)).max() < 1e-9
         # The trajectory follows the path.
-        on_path = path.vector_values(np.linspace(0.0, 1.0, 2000)).T
+        on_path = path.values(np.linspace(0.0, 1.0, 2000))
         for q in trajectory.vector_values(np.linspace(0.0, trajectory.end_time(), 50)).T:
             assert np.abs(on_path - q).max(axis=1).min() < 2e-3
 
@@ -158,14 +172,14 @@ def test_limits_that_no_speed_satisfies_are_named() -> None:
 def test_a_trajectory_is_scaled_until_one_limit_is_active(payload: Payload) -> None:
     end = HOME + np.array([0.8, -0.4, 0.5, 0.3, 0.0, 0.2])
     points = np.vstack([[HOME] * 3, linear_joint_path(HOME, end), [end] * 3])
-    basis = BsplineBasis(4, len(points), KnotVectorType.kClampedUniform, 0.0, 0.3)
-    too_fast = BsplineTrajectory(basis, points.T)
+    too_fast = CubicSpline(0.3 * clamped_knots(len(points)), points)
     limits = MotionLimits(ARM, payload)
     found = scale_to_limits(too_fast, limits)
-    assert isinstance(found, BsplineTrajectory)
-    assert 0.99 < max(limit_ratios(found, payload).values()) < 1.002
-    assert found.value(found.end_time()).ravel() == pytest.approx(end)
-    assert found.value(found.end_time() / 2) == pytest.approx(too_fast.value(0.15))
+    assert isinstance(found, CubicSpline)
+    assert 0.99 < max(limit_ratios(found.to_trajectory(), payload).values()) < 1.002
+    middle, last = found.values(found.end_time * np.array([0.5, 1.0]))
+    assert last == pytest.approx(end)
+    assert middle == pytest.approx(too_fast.values(np.array([0.15]))[0])
     assert scale_to_limits(found, limits) is found, "as it is, if the limits hold"
 
 
@@ -174,10 +188,11 @@ def test_time_optimal_durations_equal_those_of_drakes_toppra() -> None:
     unlimited_jerk = cell_with("robot.limits.jerk=null")
     for _ in range(3):
         path = corner_path(generator)
-        toppra = Toppra(path, dynamics_plant(ARM, Payload()), np.linspace(0.0, 1.0, 300))
+        drake_path = path.to_trajectory()
+        toppra = Toppra(drake_path, dynamics_plant(ARM, Payload()), np.linspace(0.0, 1.0, 300))
         toppra.AddJointVelocityLimit(-ROBOT.velocity_limits, ROBOT.velocity_limits)
         toppra.AddJointAccelerationLimit(-ROBOT.acceleration_limits, ROBOT.acceleration_limits)
-        problem = path_speed_problem(to_scipy(path), MotionLimits(unlimited_jerk, Payload()))
+        problem = path_speed_problem(path, MotionLimits(unlimited_jerk, Payload()))
         speeds = problem.time_optimal_speeds()
         duration = (2 * np.diff(problem.grid) / (speeds[1:] + speeds[:-1])).sum()
         assert duration == pytest.approx(toppra.SolvePathParameterization().end_time(), rel=0.01)

@@ -284,7 +284,7 @@ def path_distances(  # type: ignore[no-untyped-def]
     """
     n = len(revolute)
     frames = np.empty((n + 1, 4, 4))
-    moved = np.empty((n + 1, 3, 4))
+    moved = np.empty((n, 3, 4))
     world = np.empty((len(depths), 3))
     p_A, p_B = np.empty(3), np.empty(3)
     count = 0
@@ -294,18 +294,7 @@ def path_distances(  # type: ignore[no-untyped-def]
             for x in range(3):
                 world[k, i] += X_TS[k, i, x] * centers[k, x]
     for row in range(len(q)):
-        chain_frames(fixed, revolute, q[row], frames)
-        for j in range(n):
-            c, s, slide = 1.0, 0.0, 0.0
-            if revolute[j]:
-                c, s = np.cos(q[row, j]), np.sin(q[row, j])
-            else:
-                slide = q[row, j]
-            for i in range(3):
-                moved[j, i, 0] = frames[j, i, 0] * c + frames[j, i, 1] * s
-                moved[j, i, 1] = frames[j, i, 1] * c - frames[j, i, 0] * s
-                moved[j, i, 2] = frames[j, i, 2]
-                moved[j, i, 3] = frames[j, i, 3] + slide * frames[j, i, 2]
+        chain_frames(fixed, revolute, q[row], frames, moved)
         for k in range(len(depths)):
             if depths[k] == 0:
                 continue

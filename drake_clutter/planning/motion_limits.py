@@ -10,13 +10,12 @@ from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import BsplineBasis
-from pydrake.trajectories import BsplineTrajectory
-from scipy.interpolate import BSpline
 
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.compilation import njit
 from drake_clutter.planning.arm_dynamics import arm_dynamics
+from drake_clutter.planning.cubic_spline import CubicSpline, MotionSamples
 from drake_clutter.robots.chain_dynamics import ChainDynamics
 from drake_clutter.robots.robot_model import RobotModel, load_robot
 
@@ -44,14 +43,16 @@ class LimitKind(Enum):
 
 
 _TIME_ORDERS = {
+    LimitKind.POSITION: 0,
     LimitKind.VELOCITY: 1,
-    LimitKind.TOOL_SPEED: 1,
     LimitKind.ACCELERATION: 2,
-    LimitKind.LOAD: 2,
-    LimitKind.TORQUE: 2,
     LimitKind.JERK: 3,
+    LimitKind.TORQUE: 2,
+    LimitKind.LOAD: 2,
+    LimitKind.TOOL_SPEED: 1,
 }
-"""Power of the time scale by which each kind decreases; the torque without that of gravity."""
+"""Power of the time scale by which each kind decreases, in the order of `LimitKind`; the torque
+without that of gravity."""
 
 
 @dataclass(frozen=True)
@@ -70,23 +71,6 @@ class LimitViolation:
 
     def __str__(self) -> str:
         return f"{self.kind.value} of {self.joint}" if self.joint else self.kind.value
-
-
-@dataclass(frozen=True)
-class MotionSamples:
-    """Samples of a motion.
-
-    Attributes:
-        q: Positions [rad]. Shape (m, n).
-        v: Velocities [rad/s]. Shape (m, n).
-        a: Accelerations [rad/s^2]. Shape (m, n).
-        jerk: Jerks [rad/s^3]. Shape (m, n).
-    """
-
-    q: Floats
-    v: Floats
-    a: Floats
-    jerk: Floats
 
 
 class MotionLimits:
@@ -121,100 +105,151 @@ class MotionLimits:
         self.dynamics = arm_dynamics(cell, payload)
         tools = [tool.X_FG.translation() for tool in cell.gripper.tools.values()]
         self.p_FC = np.array([payload.p_FCm, *tools])
+        n = self.robot.num_joints
+        widths = {LimitKind.LOAD: 1, LimitKind.TOOL_SPEED: len(tools)}
+        self._widths = [widths.get(kind, n) for kind in LimitKind]
 
-    def ratios(self, motion: MotionSamples) -> dict[LimitKind, Floats]:
+    def ratios(self, motion: MotionSamples) -> "LimitRatios":
         """Return the ratios of a motion to its limits.
 
         Args:
             motion: Samples of the motion.
-
-        Returns:
-            Ratios; a limit is exceeded above 1. The ratio of a torque is that of its part without
-            gravity to what gravity leaves of the limit; it is infinite if gravity leaves nothing.
-            Shapes (m, n) for limits of joints, (m, 1) of the load, (m, k) of the tools.
         """
         robot = self.robot
-        lower, upper = robot.position_limits.T
-        q, v, a = motion.q, motion.v, motion.a
-        moved = self.dynamics.motion(q, v, a, self.p_FC)
-        gravity, dynamic = moved.gravity_torques, moved.dynamic_torques
-        reserve = robot.torque_limits - np.sign(dynamic) * gravity
-        is_held = np.abs(gravity) < robot.torque_limits
-        return {
-            LimitKind.POSITION: np.abs(2 * q - lower - upper) / (upper - lower),
-            LimitKind.VELOCITY: np.abs(v) / robot.velocity_limits,
-            LimitKind.ACCELERATION: np.abs(a) / robot.acceleration_limits,
-            LimitKind.JERK: np.abs(motion.jerk) / robot.jerk_limits,
-            LimitKind.TORQUE: np.where(is_held, np.abs(dynamic) / reserve, np.inf),
-            LimitKind.LOAD: _norms(moved.accelerations[:, :1]) / self.payload.max_acceleration,
-            LimitKind.TOOL_SPEED: _norms(moved.velocities[:, 1:]) / self.max_tool_speed,
-        }
+        moved = self.dynamics.motion(motion.q, motion.v, motion.a, self.p_FC)
+        values = np.empty((len(motion.q), sum(self._widths)))
+        _calc_ratios(
+            motion.q,
+            motion.v,
+            motion.a,
+            motion.jerk,
+            moved.gravity_torques,
+            moved.dynamic_torques,
+            moved.velocities,
+            moved.accelerations,
+            robot.position_limits,
+            robot.velocity_limits,
+            robot.acceleration_limits,
+            robot.jerk_limits,
+            robot.torque_limits,
+            self.payload.max_acceleration,
+            self.max_tool_speed,
+            values,
+        )
+        return LimitRatios(values, np.repeat([*LimitKind], self._widths))
 
-    def find_violation(self, ratios: dict[LimitKind, Floats]) -> LimitViolation | None:
+    def find_violation(self, ratios: "LimitRatios") -> LimitViolation | None:
         """Return the limit that is exceeded most by more than `LIMIT_TOLERANCE`, if any."""
-        kind = max(ratios, key=lambda kind: ratios[kind].max())
-        ratio = float(ratios[kind].max())
+        largest = ratios.values.max(axis=0)
+        column = int(largest.argmax())
+        ratio = float(largest[column])
         if ratio <= 1 + LIMIT_TOLERANCE:
             return None
-        joint = int(ratios[kind].max(axis=0).argmax())
+        kind = ratios.kinds[column]
         is_tool = kind in (LimitKind.LOAD, LimitKind.TOOL_SPEED)
+        joint = column % self.robot.num_joints
         return LimitViolation(kind, "" if is_tool else self.robot.joint_names[joint], ratio)
 
 
-def _norms(vectors: Floats) -> Floats:
-    """Return the lengths, shape (m, k), of vectors of shape (m, k, 3)."""
-    return np.asarray(np.sqrt((vectors**2).sum(axis=-1)))
+@dataclass(frozen=True)
+class LimitRatios:
+    """Ratios of a motion to its limits; a limit is exceeded above 1.
 
+    The ratio of a torque is that of its part without gravity to what gravity leaves of the limit;
+    it is infinite if gravity leaves nothing.
 
-def time_scales(ratios: dict[LimitKind, Floats]) -> Floats:
-    """Return the time scale at each sample that brings all ratios to at most 1.
-
-    Args:
-        ratios: Result of `MotionLimits.ratios`. Limits that do not depend on time are ignored.
-
-    Returns:
-        Factors by which the motion has to be slowed down; below 1 where it may be faster. Shape
-        (m,).
+    Attributes:
+        values: Ratios. Shape (m, k).
+        kinds: Kind of each column: `LimitKind` of each joint, of the load or of each tool. Shape
+            (k,).
     """
-    scales = [ratios[kind].max(axis=1) ** (1 / order) for kind, order in _TIME_ORDERS.items()]
-    return np.asarray(np.max(scales, axis=0))
+
+    values: Floats
+    kinds: NDArray[np.object_]
+
+    def time_scales(self) -> Floats:
+        """Return the time scale at each sample that brings all ratios to at most 1.
+
+        Limits that do not depend on time are ignored.
+
+        Returns:
+            Factors by which the motion has to be slowed down; below 1 where it may be faster.
+            Shape (m,).
+        """
+        scales = np.empty(len(self.values))
+        orders = np.array([_TIME_ORDERS[kind] for kind in self.kinds])
+        _calc_time_scales(self.values, orders, scales)
+        return scales
 
 
-def sample_spline(trajectory: BsplineTrajectory, period: float = CHECK_PERIOD) -> MotionSamples:
+@njit(cache=True, nogil=True)
+def _norm(x, y, z):  # type: ignore[no-untyped-def]
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@njit(cache=True, nogil=True)
+def _calc_ratios(  # type: ignore[no-untyped-def]
+    q,
+    v,
+    a,
+    jerk,
+    gravity,
+    dynamic,
+    velocities,
+    accelerations,
+    position_limits,
+    velocity_limits,
+    acceleration_limits,
+    jerk_limits,
+    torque_limits,
+    max_load_acceleration,
+    max_tool_speed,
+    values,
+):
+    """Write the ratios, in the order of `LimitKind`, see `MotionLimits`."""
+    n = q.shape[1]
+    for k in range(len(q)):
+        for j in range(n):
+            lower, upper = position_limits[j]
+            values[k, j] = abs(2 * q[k, j] - lower - upper) / (upper - lower)
+            values[k, n + j] = abs(v[k, j]) / velocity_limits[j]
+            values[k, 2 * n + j] = abs(a[k, j]) / acceleration_limits[j]
+            values[k, 3 * n + j] = abs(jerk[k, j]) / jerk_limits[j]
+            torque = np.inf
+            if abs(gravity[k, j]) < torque_limits[j]:
+                reserve = torque_limits[j] - np.sign(dynamic[k, j]) * gravity[k, j]
+                torque = abs(dynamic[k, j]) / reserve
+            values[k, 4 * n + j] = torque
+        x, y, z = accelerations[k, 0]
+        values[k, 5 * n] = _norm(x, y, z) / max_load_acceleration
+        for tool in range(1, velocities.shape[1]):
+            x, y, z = velocities[k, tool]
+            values[k, 5 * n + tool] = _norm(x, y, z) / max_tool_speed
+
+
+@njit(cache=True, nogil=True)
+def _calc_time_scales(values, orders, scales):  # type: ignore[no-untyped-def]
+    """Write the time scales (m,) of ratios (m, k)."""
+    for k in range(len(values)):
+        largest = np.zeros(4)
+        for column in range(len(orders)):
+            order = orders[column]
+            largest[order] = max(largest[order], values[k, column])
+        scales[k] = max(largest[1], math.sqrt(largest[2]), largest[3] ** (1 / 3))
+
+
+def sample_spline(trajectory: CubicSpline, period: float = CHECK_PERIOD) -> MotionSamples:
     """Return samples of a cubic B-spline over time, including both ends.
 
     Args:
         trajectory: Joint positions over time.
         period: Largest time between two samples [s].
     """
-    end_time = trajectory.end_time()
-    times = np.linspace(0.0, end_time, math.ceil(end_time / period) + 1)
-    spline = to_scipy(trajectory)
-    # The jerk is constant between two knots: the last sample takes that of the last interval.
-    within = np.minimum(times, end_time * (1 - 1e-9))
-    return MotionSamples(spline(times), spline(times, 1), spline(times, 2), spline(within, 3))
+    end_time = trajectory.end_time
+    return trajectory.sample(np.linspace(0.0, end_time, math.ceil(end_time / period) + 1))
 
 
-def to_scipy(trajectory: BsplineTrajectory) -> BSpline:
-    """Return a B-spline of Drake as one of SciPy, which evaluates all samples in one call."""
-    basis = trajectory.basis()
-    return BSpline(
-        np.array(basis.knots()),
-        np.hstack(trajectory.control_points()).T,
-        basis.degree(),
-    )
-
-
-def scale_time(trajectory: BsplineTrajectory, scale: float) -> BsplineTrajectory:
-    """Return a trajectory whose duration is multiplied by a factor."""
-    basis = trajectory.basis()
-    knots = scale * np.array(basis.knots())
-    return BsplineTrajectory(BsplineBasis(basis.order(), knots), trajectory.control_points())
-
-
-def scale_to_limits(
-    trajectory: BsplineTrajectory, limits: MotionLimits
-) -> BsplineTrajectory | LimitViolation:
+def scale_to_limits(trajectory: CubicSpline, limits: MotionLimits) -> CubicSpline | LimitViolation:
     """Return a trajectory that satisfies all limits at `CHECK_PERIOD`.
 
     A trajectory that exceeds a limit is slowed down uniformly, and checked again.
@@ -231,8 +266,9 @@ def scale_to_limits(
         violation = limits.find_violation(ratios)
         if violation is None:
             return trajectory
-        scale = float(time_scales(ratios).max())
+        scale = float(ratios.time_scales().max())
         if violation.kind is LimitKind.POSITION or not math.isfinite(scale):
             break
-        trajectory = scale_time(trajectory, max(scale, 1.0))
+        trajectory = trajectory.scaled(max(scale, 1.0))
+    assert violation is not None
     return violation

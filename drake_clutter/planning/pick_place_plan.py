@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.trajectories import Trajectory
+from pydrake.trajectories import BsplineTrajectory, Trajectory
 
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.planning.collision_model import SignedDistance
@@ -104,14 +104,14 @@ class TrajectorySegment:
 
     Attributes:
         name: `approach`, `carry` or `retreat`.
-        trajectory: Joint positions over time. Shape (n,).
+        trajectory: Joint positions over time, a cubic B-spline. Shape (n,).
         min_distance: Smallest signed distance along the trajectory, without self-collision pairs
             and pairs that are allowed to touch.
         unoptimized_duration: Duration before trajectory optimization [s].
     """
 
     name: str
-    trajectory: Trajectory
+    trajectory: BsplineTrajectory
     min_distance: SignedDistance
     unoptimized_duration: float
 

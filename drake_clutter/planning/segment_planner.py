@@ -12,11 +12,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
-from pydrake.trajectories import PiecewisePolynomial, Trajectory
+from pydrake.trajectories import PiecewisePolynomial
 
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.collision_model import CollisionModel, SignedDistance
+from drake_clutter.planning.cubic_spline import CubicSpline
 from drake_clutter.planning.motion_limits import LimitViolation, MotionLimits, scale_to_limits
 from drake_clutter.planning.pick_place_plan import (
     DESCENT_SPEED,
@@ -316,7 +317,9 @@ class SegmentPlanner:
                 trajectory.ratio,
             )
             return None
-        return TrajectorySegment(name, trajectory, min_distance, trajectory.end_time())
+        return TrajectorySegment(
+            name, trajectory.to_trajectory(), min_distance, trajectory.end_time
+        )
 
     def set_up_segment(self, segment_name: str, candidate: GraspCandidate) -> None:
         """Set the pose of the picked object in the collision model for a segment."""
@@ -334,7 +337,7 @@ class SegmentPlanner:
     def _check_segment(
         self,
         segment_name: str,
-        path: Trajectory,
+        path: CubicSpline,
         candidate: GraspCandidate,
         endpoints: tuple[EndpointContext, EndpointContext],
         progress: int,
@@ -446,7 +449,7 @@ class SegmentPlanner:
         trajectory = scale_to_limits(optimized, limits)
         if (
             isinstance(trajectory, LimitViolation)
-            or trajectory.end_time() >= segment.unoptimized_duration
+            or trajectory.end_time >= segment.unoptimized_duration
         ):
             return segment
         # Optimized paths pass obstacles closely: the check is denser than that of the initial path.
@@ -455,7 +458,9 @@ class SegmentPlanner:
         )
         if closest is None:
             return segment
-        return TrajectorySegment(segment.name, trajectory, closest, segment.unoptimized_duration)
+        return TrajectorySegment(
+            segment.name, trajectory.to_trajectory(), closest, segment.unoptimized_duration
+        )
 
     def plan_guarded_descent(
         self, candidate: GraspCandidate, place: EndpointContext, q_place: Floats
@@ -498,7 +503,7 @@ class SegmentPlanner:
         trajectory = parameterize_time_optimal(bspline_path(np.array(path)), limits)
         if isinstance(trajectory, LimitViolation):
             return None
-        times = np.linspace(0.0, trajectory.end_time(), 10 * len(path))
-        heights = self._tools[candidate.tool].pose(trajectory.vector_values(times).T)[:, 2, 3]
+        times = np.linspace(0.0, trajectory.end_time, 10 * len(path))
+        heights = self._tools[candidate.tool].pose(trajectory.values(times))[:, 2, 3]
         depth = PiecewisePolynomial.FirstOrderHold(times, (heights[0] - heights)[None])
-        return GuardedDescent(trajectory, depth)
+        return GuardedDescent(trajectory.to_trajectory(), depth)

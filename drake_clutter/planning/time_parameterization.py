@@ -8,20 +8,22 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import BsplineBasis, KnotVectorType
-from pydrake.trajectories import BsplineTrajectory, Trajectory
-from scipy.interpolate import BSpline, CubicHermiteSpline
+from pydrake.trajectories import Trajectory
 from scipy.ndimage import maximum_filter1d
 
+from drake_clutter.compilation import njit
+from drake_clutter.planning.cubic_spline import (
+    SPLINE_ORDER,
+    CubicSpline,
+    MotionSamples,
+    clamped_knots,
+    uniform_spline,
+)
 from drake_clutter.planning.motion_limits import (
     LIMIT_TOLERANCE,
     LimitViolation,
     MotionLimits,
-    MotionSamples,
-    scale_time,
     scale_to_limits,
-    time_scales,
-    to_scipy,
 )
 from drake_clutter.planning.toppra import solve_toppra
 from drake_clutter.robots.robot_model import RobotModel
@@ -39,8 +41,6 @@ change its sign at once."""
 SPLINE_PERIOD = 0.005
 """Time between the knots of a trajectory [s]. Between its control points, which lie on the path, a
 spline passes at a sixth of their second difference: 0.04 mrad at 10 rad/s^2."""
-_SPLINE_ORDER = 4
-"""Order of the B-splines: cubic, so that accelerations are continuous."""
 _NUM_GRID_POINTS = 300
 """Points of a path at which limits are imposed."""
 _NUM_ROUNDS = 3
@@ -88,7 +88,7 @@ def linear_joint_path(start: Floats, end: Floats) -> Floats:
     return np.linspace(start, end, count)
 
 
-def bspline_path(waypoints: Floats) -> BsplineTrajectory:
+def bspline_path(waypoints: Floats) -> CubicSpline:
     """Return a cubic B-spline that has the waypoints as control points.
 
     The path starts at the first and ends at the last waypoint, and blends the corners.
@@ -96,23 +96,16 @@ def bspline_path(waypoints: Floats) -> BsplineTrajectory:
     Args:
         waypoints: Configurations. Shape (m, n).
     """
-    is_distinct = np.concatenate([[True], np.abs(np.diff(waypoints, axis=0)).max(axis=1) > 1e-9])
-    points = waypoints[is_distinct]
-    while len(points) < _SPLINE_ORDER - 2:
-        points = np.insert(points, 1, (points[0] + points[1]) / 2, axis=0)
+    is_distinct = np.abs(waypoints[1:] - waypoints[:-1]).max(axis=1) > 1e-9
+    points = np.vstack([waypoints[:1], waypoints[1:][is_distinct]])
     # Control points at a third of the first and last step. Without them the derivative by the path
     # parameter would be three times as large at the ends as elsewhere.
-    points = np.insert(
-        points,
-        [1, len(points) - 1],
-        [(2 * points[0] + points[1]) / 3, (2 * points[-1] + points[-2]) / 3],
-        axis=0,
-    )
-    basis = BsplineBasis(_SPLINE_ORDER, len(points), KnotVectorType.kClampedUniform, 0.0, 1.0)
-    return BsplineTrajectory(basis, points.T)
+    second, last_but_one = (2 * points[0] + points[1]) / 3, (2 * points[-1] + points[-2]) / 3
+    points = np.vstack([points[:1], second, points[1:-1], last_but_one, points[-1:]])
+    return CubicSpline(clamped_knots(len(points)), points)
 
 
-def sample_path(path: Trajectory, spacing: float = MAX_JOINT_STEP / 2) -> Floats:
+def sample_path(path: CubicSpline, spacing: float = MAX_JOINT_STEP / 2) -> Floats:
     """Return configurations at uniform parameters, about `spacing` apart.
 
     Args:
@@ -122,14 +115,15 @@ def sample_path(path: Trajectory, spacing: float = MAX_JOINT_STEP / 2) -> Floats
     Returns:
         Configurations. Shape (m, n).
     """
-    coarse = path.vector_values(np.linspace(path.start_time(), path.end_time(), 60)).T
-    count = max(20, math.ceil(np.abs(np.diff(coarse, axis=0)).max(axis=1).sum() / spacing))
-    return np.asarray(path.vector_values(np.linspace(path.start_time(), path.end_time(), count)).T)
+    coarse = path.values(np.linspace(path.start_time, path.end_time, 60))
+    length = np.abs(coarse[1:] - coarse[:-1]).max(axis=1).sum()
+    count = max(20, math.ceil(length / spacing))
+    return path.values(np.linspace(path.start_time, path.end_time, count))
 
 
 def parameterize_time_optimal(
-    path: BsplineTrajectory, limits: MotionLimits
-) -> BsplineTrajectory | LimitViolation:
+    path: CubicSpline, limits: MotionLimits
+) -> CubicSpline | LimitViolation:
     """Return a nearly time-optimal trajectory along a path, at rest with zero acceleration at ends.
 
     TOPP-RA finds the time-optimal speeds with steps of the acceleration. Their moving average over
@@ -145,20 +139,19 @@ def parameterize_time_optimal(
     Returns:
         The trajectory, or the limit that it exceeds at any speed.
     """
-    spline = to_scipy(path)
-    problem = path_speed_problem(spline, limits)
+    problem = path_speed_problem(path, limits)
     squared_scales = np.ones(_NUM_GRID_POINTS)
     shortest, best = math.inf, path
     for _ in range(_NUM_ROUNDS):
         s = smooth_time_scaling(problem.grid, problem.time_optimal_speeds(squared_scales))
-        points = spline(s)
-        scales = time_scales(limits.ratios(_samples_at_knots(points)))
+        points = path.values(s)
+        scales = limits.ratios(_samples_at_knots(points)).time_scales()
         scale = float(scales.max())
         if not math.isfinite(scale):
-            return scale_to_limits(_uniform_bspline(points), limits)
+            return scale_to_limits(uniform_spline(points, SPLINE_PERIOD), limits)
         scale = max(scale, 1.0)
         if scale * len(points) < shortest:
-            shortest, best = scale * len(points), scale_time(_uniform_bspline(points), scale)
+            shortest, best = scale * len(points), uniform_spline(points, scale * SPLINE_PERIOD)
         if scale <= 1 + LIMIT_TOLERANCE:
             break
         # The smoothing mixes accelerations within half its width on either side.
@@ -219,7 +212,7 @@ class PathSpeedProblem:
         return np.sqrt(squared_speeds)
 
 
-def path_speed_problem(path: BSpline, limits: MotionLimits) -> PathSpeedProblem:
+def path_speed_problem(path: CubicSpline, limits: MotionLimits) -> PathSpeedProblem:
     """Return the limits of the speed along a path, without those of jerk and torque.
 
     Args:
@@ -228,7 +221,8 @@ def path_speed_problem(path: BSpline, limits: MotionLimits) -> PathSpeedProblem:
     """
     robot = limits.robot
     grid = np.linspace(0.0, 1.0, _NUM_GRID_POINTS)
-    q, dq_ds, d2q_ds2 = (path(grid, order) for order in range(3))
+    on_path = path.sample(grid)
+    q, dq_ds, d2q_ds2 = on_path.q, on_path.v, on_path.a
     X_BF = robot.forward_kinematics(q)
     rows = [(dq_ds, d2q_ds2, robot.acceleration_limits)]
     if math.isfinite(limits.payload.max_acceleration):
@@ -246,10 +240,9 @@ def path_speed_problem(path: BSpline, limits: MotionLimits) -> PathSpeedProblem:
         dp_ds = np.gradient(p_BG, grid, axis=0, edge_order=2)
         tool_speeds = np.linalg.norm(dp_ds, axis=2).max(axis=1)
         max_speeds = np.minimum(max_speeds, limits.max_tool_speed / np.maximum(tool_speeds, 1e-12))
-    d3q_ds3 = path(np.minimum(grid, 1 - 1e-9), 3)
     with np.errstate(divide="ignore"):
         max_speeds = np.minimum(
-            max_speeds, np.cbrt(robot.jerk_limits / np.abs(d3q_ds3)).min(axis=1)
+            max_speeds, np.cbrt(robot.jerk_limits / np.abs(on_path.jerk)).min(axis=1)
         )
     max_squared_speeds = np.minimum(max_speeds**2, _MAX_SQUARED_SPEED)
     return PathSpeedProblem(grid, a, b, bounds, max_squared_speeds)
@@ -269,25 +262,35 @@ def smooth_time_scaling(grid: Floats, speeds: Floats) -> Floats:
         Values of s. Shape (k,).
     """
     times = np.concatenate([[0.0], np.cumsum(2 * np.diff(grid) / (speeds[1:] + speeds[:-1]))])
-    integral = CubicHermiteSpline(times, grid, speeds).antiderivative()
     half_width = SMOOTHING_TIME / 2
-    count = math.ceil((times[-1] + SMOOTHING_TIME) / SPLINE_PERIOD) + 5
-    centers = (np.arange(count) - 2) * SPLINE_PERIOD - half_width
-
-    def integrate(t: Floats) -> Floats:
-        """Return the integral of s until t, where s stays at its ends before and after."""
-        after = np.maximum(t - times[-1], 0.0) * grid[-1]
-        return np.asarray(integral(np.clip(t, 0.0, times[-1])) + after)
-
-    mean = (integrate(centers + half_width) - integrate(centers - half_width)) / SMOOTHING_TIME
-    return np.asarray(np.clip(mean, grid[0], grid[-1]))
+    count = math.ceil((times[-1] + SMOOTHING_TIME) / SPLINE_PERIOD) + 2 * SPLINE_ORDER - 3
+    centers = (np.arange(count) - (SPLINE_ORDER - 2)) * SPLINE_PERIOD - half_width
+    upper, lower = np.empty(count), np.empty(count)
+    _integrate(times, grid, speeds, centers + half_width, upper)
+    _integrate(times, grid, speeds, centers - half_width, lower)
+    return np.asarray(np.clip((upper - lower) / SMOOTHING_TIME, grid[0], grid[-1]))
 
 
-def _uniform_bspline(points: Floats) -> BsplineTrajectory:
-    """Return the uniform B-spline with knots `SPLINE_PERIOD` apart. Shape of the points (k, n)."""
-    duration = SPLINE_PERIOD * (len(points) - _SPLINE_ORDER + 1)
-    basis = BsplineBasis(_SPLINE_ORDER, len(points), KnotVectorType.kUniform, 0.0, duration)
-    return BsplineTrajectory(basis, points.T)
+@njit(cache=True, nogil=True)
+def _integrate(times, grid, speeds, ends, integrals):  # type: ignore[no-untyped-def]
+    """Write the integrals (k,) of s from 0 to ascending times (k,), see `smooth_time_scaling`.
+
+    s stays at its ends before and after.
+    """
+    total = 0.0
+    m = 0
+    for k in range(len(ends)):
+        while m < len(times) - 1 and times[m + 1] < ends[k]:
+            dt = times[m + 1] - times[m]
+            acceleration = (speeds[m + 1] - speeds[m]) / dt
+            total += dt * (grid[m] + dt * (speeds[m] / 2 + dt * acceleration / 6))
+            m += 1
+        if m == len(times) - 1:
+            integrals[k] = total + (ends[k] - times[m]) * grid[m]
+        else:
+            dt = max(ends[k] - times[m], 0.0)
+            acceleration = (speeds[m + 1] - speeds[m]) / (times[m + 1] - times[m])
+            integrals[k] = total + dt * (grid[m] + dt * (speeds[m] / 2 + dt * acceleration / 6))
 
 
 def _samples_at_knots(points: Floats) -> MotionSamples:

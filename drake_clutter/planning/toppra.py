@@ -15,26 +15,52 @@ from drake_clutter.compilation import njit
 
 Floats = NDArray[np.float64]
 
-_NUM_BISECTIONS = 50
-"""Bisection steps for the largest controllable x, to below double precision."""
+_MIN_COEFFICIENT = 1e-12
+"""A limit with a smaller coefficient of u is one of x alone."""
+_MAX_STEPS = 50
+"""Largest number of steps to the largest controllable x; each step drops an active limit."""
 
 
 @njit(cache=True, nogil=True)
-def _acceleration_range(a, b, lower, upper, x):  # type: ignore[no-untyped-def]
-    """Return the smallest and the largest u that the limits allow at x.
+def _acceleration_range(a, b, lower, upper, x, first):  # type: ignore[no-untyped-def]
+    """Return the smallest and the largest u that limits allow at x, with their slopes by x.
 
-    The smallest is above the largest if the limits allow no u.
+    The smallest is above the largest if the limits allow no u. Limits of x alone are ignored.
+
+    Args:
+        a: Coefficients of u. Shape (rows,).
+        b: Coefficients of x. Shape (rows,).
+        lower: Lower limits. Shape (rows,).
+        upper: Upper limits. Shape (rows,).
+        x: Squared path speed.
+        first: Range and slopes of other limits.
     """
-    u_min, u_max = -np.inf, np.inf
+    u_min, u_max, min_slope, max_slope = first
     for row in range(len(a)):
-        low, high = lower[row] - b[row] * x, upper[row] - b[row] * x
-        if a[row] > 1e-12:
-            u_min, u_max = max(u_min, low / a[row]), min(u_max, high / a[row])
-        elif a[row] < -1e-12:
-            u_min, u_max = max(u_min, high / a[row]), min(u_max, low / a[row])
-        elif low > 0 or high < 0:
-            return 1.0, 0.0
-    return u_min, u_max
+        if abs(a[row]) <= _MIN_COEFFICIENT:
+            continue
+        inverse = 1 / a[row]
+        slope = -b[row] * inverse
+        low, high = lower[row] * inverse, upper[row] * inverse
+        if inverse < 0:
+            low, high = high, low
+        if low + slope * x > u_min:
+            u_min, min_slope = low + slope * x, slope
+        if high + slope * x < u_max:
+            u_max, max_slope = high + slope * x, slope
+    return u_min, u_max, min_slope, max_slope
+
+
+@njit(cache=True, nogil=True)
+def _largest_x(a, b, lower, upper, x):  # type: ignore[no-untyped-def]
+    """Return the largest x up to a given one that the limits of x alone allow."""
+    for row in range(len(a)):
+        if abs(a[row]) <= _MIN_COEFFICIENT:
+            if b[row] > 0:
+                x = min(x, upper[row] / b[row])
+            elif b[row] < 0:
+                x = min(x, lower[row] / b[row])
+    return x
 
 
 def solve_toppra(
@@ -60,40 +86,39 @@ def solve_toppra(
     Returns:
         x at the grid points. Shape (m,).
     """
-    a_next = a[1:] + 2 * step * b[1:]
-    squared_speeds: Floats = _solve_toppra(
-        step,
-        np.hstack((a[:-1], a_next)),
-        np.hstack((b[:-1], b[1:])),
-        np.hstack((lower[:-1], lower[1:])),
-        np.hstack((upper[:-1], upper[1:])),
-        max_squared_speeds,
-    )
-    return squared_speeds
+    x = np.empty(len(a))
+    _solve_toppra(step, a, a[1:] + 2 * step * b[1:], b, lower, upper, max_squared_speeds, x)
+    return x
 
 
 @njit(cache=True, nogil=True)
-def _solve_toppra(step, a, b, lower, upper, max_squared_speeds):  # type: ignore[no-untyped-def]
-    n = len(max_squared_speeds)
-    # Backward pass: the largest x at each point from which rest at the end is reachable.
+def _solve_toppra(step, a, a_next, b, lower, upper, max_squared_speeds, x):  # type: ignore[no-untyped-def]
+    n = len(x)
+    # Backward pass: the largest x at each point from which rest at the end is reachable. The limits
+    # of u over x are lines: where they cross, the excess of the smallest u over the largest is 0.
+    # It is convex in x, so that steps of Newton's method from above do not pass the crossing.
     controllable = np.zeros(n)
     for i in range(n - 2, -1, -1):
-        feasible, infeasible, x = 0.0, max_squared_speeds[i], max_squared_speeds[i]
-        for _ in range(_NUM_BISECTIONS):
-            u_min, u_max = _acceleration_range(a[i], b[i], lower[i], upper[i], x)
-            u_min = max(u_min, -x / (2 * step))
-            u_max = min(u_max, (controllable[i + 1] - x) / (2 * step))
-            if u_min <= u_max:
-                feasible = x
-                if x == max_squared_speeds[i]:
-                    break
-            else:
-                infeasible = x
-            x = (feasible + infeasible) / 2
-        controllable[i] = feasible
+        at = max_squared_speeds[i]
+        at = _largest_x(a[i], b[i], lower[i], upper[i], at)
+        at = _largest_x(a_next[i], b[i + 1], lower[i + 1], upper[i + 1], at)
+        for _ in range(_MAX_STEPS):
+            slope = -1 / (2 * step)
+            bounds = slope * at, slope * (at - controllable[i + 1]), slope, slope
+            bounds = _acceleration_range(a[i], b[i], lower[i], upper[i], at, bounds)
+            u_min, u_max, min_slope, max_slope = _acceleration_range(
+                a_next[i], b[i + 1], lower[i + 1], upper[i + 1], at, bounds
+            )
+            if u_min <= u_max or min_slope <= max_slope:
+                break
+            at = max(at - (u_min - u_max) / (min_slope - max_slope), 0.0)
+        controllable[i] = at
     # Forward pass: the largest feasible acceleration at each point.
-    x = np.zeros(n)
+    unbounded = -np.inf, np.inf, 0.0, 0.0
+    x[0] = 0.0
     for i in range(n - 1):
-        _, u_max = _acceleration_range(a[i], b[i], lower[i], upper[i], x[i])
+        bounds = _acceleration_range(a[i], b[i], lower[i], upper[i], x[i], unbounded)
+        _, u_max, _, _ = _acceleration_range(
+            a_next[i], b[i + 1], lower[i + 1], upper[i + 1], x[i], bounds
+        )
         x[i + 1] = max(0.0, min(x[i] + 2 * step * u_max, controllable[i + 1]))
-    return x

@@ -29,6 +29,7 @@ from pydrake.solvers import ClarabelSolver, MathematicalProgram
 from pydrake.trajectories import BsplineTrajectory, Trajectory
 from scipy import sparse
 
+from drake_clutter.planning.cubic_spline import CubicSpline, clamped_knots
 from drake_clutter.robots.robot_model import RobotModel
 
 Floats = NDArray[np.float64]
@@ -133,7 +134,7 @@ class TrajectoryOptimizationProblem:
     tool_axis: Callable[[Floats], Floats]
 
 
-def optimize_trajectory(problem: TrajectoryOptimizationProblem) -> BsplineTrajectory | None:
+def optimize_trajectory(problem: TrajectoryOptimizationProblem) -> CubicSpline | None:
     """Return a faster trajectory than the initial one, or None if none is found."""
     initial_duration = problem.initial_trajectory.end_time()
     points = _fit_control_points(problem.initial_trajectory)
@@ -153,8 +154,7 @@ def optimize_trajectory(problem: TrajectoryOptimizationProblem) -> BsplineTrajec
             break
     if duration >= initial_duration:
         return None
-    knots = duration * np.array(_BASIS.knots())
-    return BsplineTrajectory(BsplineBasis(_SPLINE_ORDER, knots), points.T)
+    return CubicSpline(duration * clamped_knots(NUM_CONTROL_POINTS), points)
 
 
 def _fit_control_points(trajectory: Trajectory) -> Floats:

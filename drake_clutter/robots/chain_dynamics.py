@@ -135,29 +135,23 @@ def _calc_motion(  # type: ignore[no-untyped-def]
 ):
     """Write torques (m, n), and velocities and accelerations (m, k, 3) of points p_FC (k, 3)."""
     n = len(revolute)
-    frames = np.empty((n + 1, 4, 4))
+    frames, moved = np.empty((n + 1, 4, 4)), np.empty((n, 3, 4))
     origin = np.zeros((n + 1, 3))  # of each joint's frame; row n + 1 is that of the base
     force = np.empty((n, 3))
     moment = np.empty((n, 3))  # about the origin of the joint
     lever = np.empty((n, 3))  # mass times its lever about the origin of the joint
-    rotation = np.empty((3, 3))
     w, alpha, v_o, a_o = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
     r, dv, da, scratch, spin = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     w_J, alpha_J, h_J = np.empty(3), np.empty(3), np.empty(3)
     for k in range(len(q)):
-        chain_frames(fixed, revolute, q[k], frames)
+        chain_frames(fixed, revolute, q[k], frames, moved)
         for i in range(3):
             w[i] = alpha[i] = v_o[i] = a_o[i] = 0.0
         for j in range(n):
-            z = frames[j, :3, 2]
-            c, s = 1.0, 0.0
-            if revolute[j]:
-                c, s = np.cos(q[k, j]), np.sin(q[k, j])
+            rotation = moved[j]
+            z = rotation[:, 2]
             for i in range(3):
-                rotation[i, 0] = frames[j, i, 0] * c + frames[j, i, 1] * s
-                rotation[i, 1] = frames[j, i, 1] * c - frames[j, i, 0] * s
-                rotation[i, 2] = z[i]
-                origin[j, i] = frames[j, i, 3] + (0.0 if revolute[j] else z[i] * q[k, j])
+                origin[j, i] = rotation[i, 3]
                 r[i] = origin[j, i] - origin[j - 1, i]
             _relative_motion(w, alpha, r, dv, da, scratch)
             _cross(w, z, spin)

@@ -213,13 +213,13 @@ def _iterate(fixed, revolute, limits, home, X, q, null_space_iterations):  # typ
     The first iterations have a null-space motion towards home.
     """
     n = len(q)
-    frames = np.empty((n + 1, 4, 4))
+    frames, moved = np.empty((n + 1, 4, 4)), np.empty((n, 3, 4))
     J = np.empty((6, n))
     e = np.empty(6)
     dq_null = np.zeros(n)
     dq = np.empty(n)
     for iteration in range(_MAX_ITERATIONS):
-        chain_frames(fixed, revolute, q, frames)
+        chain_frames(fixed, revolute, q, frames, moved)
         squared_error = _pose_error(X, frames[n], e)
         if iteration >= null_space_iterations and squared_error < _ERROR_TOLERANCE**2:
             return True

@@ -83,11 +83,7 @@ class RobotModel:
 
     def forward_kinematics(self, q: Floats) -> Floats:
         """Return X_BF, shape (..., 4, 4), at joint positions of shape (..., n)."""
-        if self.ur_fit is None:
-            return self.chain.forward_kinematics(q)
-        X = kinematics.forward_kinematics(q, self.ur_fit.parameters)
-        X = X if self.ur_fit.X_B0 is None else self.ur_fit.X_B0 @ X
-        return X if self.ur_fit.X_6F is None else X @ self.ur_fit.X_6F
+        return self.chain.forward_kinematics(q)
 
     def jacobian(self, q: Floats) -> Floats:
         """Return the spatial Jacobian of F in B, angular rows first. Shape (6, n).

@@ -46,8 +46,9 @@ class SerialChain:
         Returns:
             Poses. Shape (n + 1, 4, 4).
         """
-        frames = np.empty((self.num_joints + 1, 4, 4))
-        chain_frames(self.fixed, self.revolute, np.ascontiguousarray(q, float), frames)
+        n = self.num_joints
+        frames, moved = np.empty((n + 1, 4, 4)), np.empty((n, 3, 4))
+        chain_frames(self.fixed, self.revolute, np.ascontiguousarray(q, float), frames, moved)
         return frames
 
     def jacobian(self, q: Floats) -> Floats:
@@ -73,33 +74,35 @@ class SerialChain:
 
 
 @njit(cache=True)
-def _multiply_transforms(A, B, C):  # type: ignore[no-untyped-def]
-    """Write the product A B of rigid transforms into C, which must be another array."""
-    for i in range(3):
-        for j in range(4):
-            C[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
-        C[i, 3] += A[i, 3]
-    C[3, 0] = C[3, 1] = C[3, 2] = 0.0
-    C[3, 3] = 1.0
+def chain_frames(fixed, revolute, q, frames, moved):  # type: ignore[no-untyped-def]
+    """Write joint frames and X_BF into frames (n + 1, 4, 4).
 
-
-@njit(cache=True)
-def chain_frames(fixed, revolute, q, frames):  # type: ignore[no-untyped-def]
-    """Write joint frames (without own motion) and X_BF into frames (n + 1, 4, 4)."""
+    The frames of the joints are those without their own motion; the upper rows of those with it are
+    written into moved (n, 3, 4).
+    """
     n = len(revolute)
-    moved = np.empty((4, 4))
-    frames[0] = fixed[0]
+    for i in range(4):
+        for j in range(4):
+            frames[0, i, j] = fixed[0, i, j]
     for k in range(n):
-        moved[:] = frames[k]
+        c, s, slide = 1.0, 0.0, 0.0
         if revolute[k]:
             c, s = np.cos(q[k]), np.sin(q[k])
-            for i in range(3):
-                moved[i, 0] = frames[k, i, 0] * c + frames[k, i, 1] * s
-                moved[i, 1] = frames[k, i, 1] * c - frames[k, i, 0] * s
         else:
-            for i in range(3):
-                moved[i, 3] += frames[k, i, 2] * q[k]
-        _multiply_transforms(moved, fixed[k + 1], frames[k + 1])
+            slide = q[k]
+        for i in range(3):
+            x = frames[k, i, 0] * c + frames[k, i, 1] * s
+            y = frames[k, i, 1] * c - frames[k, i, 0] * s
+            z = frames[k, i, 2]
+            p = frames[k, i, 3] + slide * z
+            moved[k, i, 0], moved[k, i, 1], moved[k, i, 2], moved[k, i, 3] = x, y, z, p
+            for j in range(4):
+                frames[k + 1, i, j] = (
+                    x * fixed[k + 1, 0, j] + y * fixed[k + 1, 1, j] + z * fixed[k + 1, 2, j]
+                )
+            frames[k + 1, i, 3] += p
+            frames[k + 1, 3, i] = 0.0
+        frames[k + 1, 3, 3] = 1.0
 
 
 @njit(cache=True)
@@ -124,9 +127,9 @@ def _forward_kinematics(fixed, revolute, q):  # type: ignore[no-untyped-def]
     """Return X_BF, shape (m, 4, 4), at joint positions q (m, n)."""
     n = len(revolute)
     poses = np.empty((len(q), 4, 4))
-    frames = np.empty((n + 1, 4, 4))
+    frames, moved = np.empty((n + 1, 4, 4)), np.empty((n, 3, 4))
     for k in range(len(q)):
-        chain_frames(fixed, revolute, q[k], frames)
+        chain_frames(fixed, revolute, q[k], frames, moved)
         poses[k] = frames[n]
     return poses
 
@@ -136,10 +139,10 @@ def _manipulability(fixed, revolute, q):  # type: ignore[no-untyped-def]
     """Return the manipulability, shape (m,), at q (m, n); NaN where q is NaN."""
     n = len(revolute)
     manipulability = np.empty(len(q))
-    frames = np.empty((n + 1, 4, 4))
+    frames, moved = np.empty((n + 1, 4, 4)), np.empty((n, 3, 4))
     J = np.empty((6, n))
     for k in range(len(q)):
-        chain_frames(fixed, revolute, q[k], frames)
+        chain_frames(fixed, revolute, q[k], frames, moved)
         chain_jacobian(frames, revolute, J)
         manipulability[k] = (
             np.sqrt(max(np.linalg.det(J @ J.T), 0.0)) if np.isfinite(q[k]).all() else np.nan

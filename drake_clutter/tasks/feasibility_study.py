@@ -15,6 +15,7 @@ from drake_clutter.catalog import Shape
 from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.planning.cubic_spline import CubicSpline
 from drake_clutter.planning.pick_place_plan import (
     PickPlacePlan,
     PlanningFailure,
@@ -300,7 +301,7 @@ class FeasibilityStudy:
                 collision_model.set_object_pose(
                     plan.pick, picked.X_TO if segment.name == "approach" else plan.X_TO_place
                 )
-            for q in sample_path(segment.trajectory):
+            for q in sample_path(CubicSpline.from_trajectory(segment.trajectory)):
                 for contact in collision_model.distances_below(q, 0.0):
                     # Expected contacts: of the gripper with the picked object, and of that object
                     # with its neighbors, whose poses have errors.
