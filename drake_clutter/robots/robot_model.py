@@ -83,7 +83,11 @@ class RobotModel:
 
     def forward_kinematics(self, q: Floats) -> Floats:
         """Return X_BF, shape (..., 4, 4), at joint positions of shape (..., n)."""
-        return self.chain.forward_kinematics(q)
+        if self.ur_fit is None:
+            return self.chain.forward_kinematics(q)
+        X = kinematics.forward_kinematics(q, self.ur_fit.parameters)
+        X = X if self.ur_fit.X_B0 is None else self.ur_fit.X_B0 @ X
+        return X if self.ur_fit.X_6F is None else X @ self.ur_fit.X_6F
 
     def jacobian(self, q: Floats) -> Floats:
         """Return the spatial Jacobian of F in B, angular rows first. Shape (6, n).

@@ -5,11 +5,13 @@ degrees about z); 1 to 6 are the Denavit-Hartenberg frames; frame 6 is the flang
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_clutter.compilation import njit
+from drake_clutter.robots.serial_chain import SerialChain
 
 Floats = NDArray[np.float64]
 
@@ -97,7 +99,13 @@ def forward_kinematics(q: Floats, parameters: DenavitHartenberg = UR10_PARAMETER
         q: Joint positions [rad]. Shape (..., 6).
         parameters: Denavit-Hartenberg parameters.
     """
-    return np.asarray(link_poses(q, parameters)[..., -1, :, :])
+    return _serial_chain(parameters).forward_kinematics(q)
+
+
+@lru_cache(maxsize=32)
+def _serial_chain(parameters: DenavitHartenberg) -> SerialChain:
+    links = [fixed_link_transform(parameters, joint) for joint in range(6)]
+    return SerialChain(np.array([np.eye(4), *links]), np.ones(6, bool))
 
 
 def jacobian(q: Floats, parameters: DenavitHartenberg = UR10_PARAMETERS) -> Floats:
