@@ -148,6 +148,29 @@ def test_only_disturbed_objects_are_settled(config: ClutterConfig) -> None:
     assert outcome.scene[untouched].X_TO == after[untouched].X_TO
 
 
+LOST = Pose((0.62, 0.05, 0.077), PLACE.quaternion)
+"""On the table beside the tray."""
+
+
+@pytest.mark.parametrize("lost", ["sugar_box", "pudding_box"])
+def test_an_object_that_leaves_the_tray_is_blamed_on_that_move(
+    lost: str, config: ClutterConfig
+) -> None:
+    """The gripper drops the picked object beside the tray, or throws another one off it."""
+    after = SCENE.with_poses({"sugar_box": PLACE, lost: LOST})
+    outcome = evaluate_outcome(SCENE, after, "sugar_box", PLACE, True, config.settle)
+    assert outcome.result is MoveResult.LEFT_TRAY
+    assert outcome.instability_text.startswith(f"{lost} left the tray")
+    assert outcome.instability_text.endswith("and is at (0.620, 0.050, 0.077) m")
+
+
+def test_later_moves_are_not_blamed_for_an_object_beside_the_tray(config: ClutterConfig) -> None:
+    before = SCENE.with_poses({"pudding_box": LOST})
+    after = before.with_poses({"sugar_box": PLACE, "pudding_box": LOST.translated((0.1, 0, 0))})
+    outcome = evaluate_outcome(before, after, "sugar_box", PLACE, False, config.settle)
+    assert (outcome.result, outcome.instability) == (MoveResult.PLACED, None)
+
+
 def test_stages_of_the_command_schedule(plan: PickPlacePlan) -> None:
     schedule = build_command_schedule(plan, DEFAULT_CELL)
     assert [name for name, _ in schedule.stage_starts] == [

@@ -288,7 +288,7 @@ def test_keeps_files_that_it_did_not_build(tmp_path: Path) -> None:
 
 
 def test_the_tray(tmp_path: Path) -> None:
-    (tmp_path / "tray.sdf").write_text(support_sdf(DEFAULT_CELL.support))
+    (tmp_path / "tray.sdf").write_text(support_sdf(DEFAULT_CELL.support, table=False))
     (tmp_path / "package.xml").write_text("<package><name>it</name></package>")
     plant, contacts = plant_of("package://it/tray.sdf", tmp_path / "package.xml")
     assert len(contacts) == 5

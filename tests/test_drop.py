@@ -5,8 +5,7 @@ import pytest
 from conftest import CLASSES, rng
 
 from drake_clutter.cell.support import Support
-from drake_clutter.scenes.scene import Pose, SceneObject
-from drake_clutter.simulation.drop import _on_tray, sample_drop_scene
+from drake_clutter.simulation.drop import sample_drop_scene
 
 NAMES = ["cracker_box", "large_marker", "tomato_soup_can", "sugar_box"] * 4
 SUPPORT = Support(size=(0.8, 0.5))
@@ -47,5 +46,4 @@ def test_only_objects_on_the_support_are_kept() -> None:
         (0.0, -0.251, 0.1, False),
         (0.0, 0.0, -0.001, False),
     ):
-        dropped = SceneObject("box", CLASSES["sugar_box"], Pose((x, y, z)))
-        assert _on_tray(dropped, SUPPORT) == expected
+        assert SUPPORT.carries((x, y, z)) == expected

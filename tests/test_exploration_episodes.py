@@ -69,9 +69,7 @@ class Scripted:
         pick = command.move.pick
         moved = scene.with_poses({pick: resting("cracker_box", xy=ASIDE[pick]).X_TO})
         fallen = (
-            Instability(InstabilityReason.SLID, "g1", 0.02, 0.0)
-            if result is MoveResult.COLLAPSED
-            else None
+            Instability(InstabilityReason.SLID, "g1", 0.02, 0.0) if result.ends_episode else None
         )
         return Outcome(result, moved, fallen)
 
@@ -129,8 +127,11 @@ def test_rewards_and_record_of_a_successful_episode(detector: LabelDetector) -> 
     assert task.scene is third.outcome.scene
 
 
-def test_objects_uncovered_by_a_collapse_do_not_count(detector: LabelDetector) -> None:
-    game = episode(detector, MoveResult.PLACED, MoveResult.COLLAPSED)
+@pytest.mark.parametrize("result", [MoveResult.COLLAPSED, MoveResult.LEFT_TRAY])
+def test_objects_uncovered_by_a_collapse_do_not_count(
+    result: MoveResult, detector: LabelDetector
+) -> None:
+    game = episode(detector, MoveResult.PLACED, result)
     task = game.task
     game.step(Move("cover 2"))
     known = task.detected
@@ -139,8 +140,8 @@ def test_objects_uncovered_by_a_collapse_do_not_count(detector: LabelDetector) -
     assert (step.newly_found, step.reward) == ((), -5.0)
     assert task.detected == known
     assert task.found == ("p",)
-    assert task.termination is TerminationReason.COLLAPSED
-    with pytest.raises(ValueError, match="collapsed"):
+    assert task.termination is TerminationReason(result.value)
+    with pytest.raises(ValueError, match=result.value):
         task.record(MoveAttempt(Decision(Move("marker")), step.outcome, step.next_perception))
 
 

@@ -11,11 +11,12 @@ import numpy as np
 import pybullet
 import pytest
 import trimesh
-from conftest import CATALOG, resting, scene_of
+from conftest import CATALOG, DEFAULT_CELL, resting, scene_of
 from numpy.typing import NDArray
 from PIL import Image
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation
 
@@ -29,9 +30,12 @@ from drake_clutter.export.model_parts import load_inertial, load_visual
 from drake_clutter.export.sdf_writer import PYBULLET_FILE
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
+from drake_clutter.scenes.interfaces import InstabilityReason
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.simulation.scene_plant import rigid_transform
+from drake_clutter.simulation.settle import settle
+from drake_clutter.station.clutter_station import ClutterStation
 from training.script import SCENES
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "custom_class"
@@ -308,6 +312,65 @@ def test_stable_scenes_stay_at_rest(
     dataset = load_scene_dataset(SCENES / f"{dataset_name}.json", CATALOG)
     scene = dataset.settled_scene(index, dataset.grammar, ClutterConfig())
     assert simulate(scene, 4.0) <= MAX_DISPLACEMENT
+
+
+TABLE_TOP = -0.011
+"""Height of the table in the default cell, and of that of simulations without a cell [m]."""
+
+
+@pytest.fixture(scope="module")
+def beside_tray(mug: ObjectClass) -> Scene:
+    """Return a box, a can, a marker and a mug 2 mm above the table beside the tray."""
+    cup = SceneObject("mug", mug, Pose((0.0, 0.5, mug.size[2] / 2)))
+    objects = (
+        resting("cracker_box", xy=(0.5, 0.5)),
+        resting("tomato_soup_can", Orientation.UPRIGHT_0, (0.5, -0.5)),
+        resting("large_marker", xy=(0.5, 0.0)),
+        cup,
+    )
+    offset = (0.0, 0.0, TABLE_TOP + 0.002)
+    return scene_of(*(replace(o, X_TO=o.X_TO.translated(offset)) for o in objects))
+
+
+def drop_in_station(scene: Scene) -> dict[str, Pose]:
+    """Return the poses in the simulation of the default cell after half a second."""
+    classes = [(o.name, o.object_class) for o in scene.objects]
+    station = ClutterStation(DEFAULT_CELL, classes, time_step=0.0025)
+    simulator = Simulator(station)
+    root = simulator.get_mutable_context()
+    home = np.array(DEFAULT_CELL.robot.home)
+    station.set_state(root, home, scene.objects)
+    command = np.concatenate([home, np.zeros(2 * len(home))])
+    station.GetInputPort("command").FixValue(root, command)
+    station.GetInputPort("gripper_command").FixValue(root, np.zeros(0))
+    simulator.AdvanceTo(0.5)
+    return station.scene_plant.poses(station.plant_context(root))
+
+
+def drop_on_tray(scene: Scene) -> dict[str, Pose]:
+    """Return the poses in the simulation of the judge, which has no cell, at rest."""
+    result = settle(scene.objects, scene.support, ClutterConfig().settle, simulate_collapse=True)
+    assert result.instability is not None
+    assert result.instability.reason is InstabilityReason.LEFT_TRAY
+    return result.poses
+
+
+@pytest.mark.parametrize("drop", [drop_in_station, drop_on_tray])
+def test_what_leaves_the_tray_lies_on_the_table(
+    drop: Callable[[Scene], dict[str, Pose]], beside_tray: Scene
+) -> None:
+    """Boxes sank through the table at 25 mm/s when their contact had a single point."""
+    for name, X_TO in drop(beside_tray).items():
+        expected = beside_tray[name].X_TO.translated((0.0, 0.0, -0.002))
+        assert X_TO.p[2] == pytest.approx(expected.p[2], abs=0.0005), name
+        assert X_TO.p == pytest.approx(expected.p, abs=0.002), name
+
+
+@pytest.mark.parametrize("simulate", [simulate_mujoco, simulate_pybullet])
+def test_exported_scenes_have_a_table(
+    simulate: Callable[[Scene, float], float], beside_tray: Scene
+) -> None:
+    assert simulate(beside_tray, 1.0) == pytest.approx(0.002, abs=0.001)
 
 
 @pytest.mark.parametrize(

@@ -117,6 +117,18 @@ def test_what_loses_its_support_falls(
     assert outcome.scene.names == STACKS.names
 
 
+def test_an_object_that_leaves_the_tray_lies_on_the_table(executor: SettleExecutor) -> None:
+    scene = scene_of(resting("gelatin_box", name="box"), resting("sugar_box", xy=(0.1, 0.1)))
+    above_table = scene["box"].X_TO.translated((0.5, 0.0, 0.0))
+    command = PickPlaceCommand(Move("box"), scene["box"].X_TO, above_table)
+    outcome = executor.execute(scene, command, rng())
+    assert outcome.result is MoveResult.LEFT_TRAY
+    x, y, z = outcome.scene["box"].X_TO.translation
+    assert z == pytest.approx(scene["box"].X_TO.p[2] - 0.011, abs=0.0005)
+    assert outcome.instability_text.startswith("box left the tray")
+    assert outcome.instability_text.endswith(f"is at ({x:.3f}, {y:.3f}, {z:.3f}) m")
+
+
 def test_a_move_without_a_free_spot_changes_nothing(
     executor: SettleExecutor, detector: LabelDetector
 ) -> None:

@@ -7,6 +7,7 @@ import h5py
 import numpy as np
 import pytest
 from conftest import cell_with, resting, scene_of
+from pydrake.systems.analysis import Simulator
 
 from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.fixture import Fixture
@@ -22,8 +23,9 @@ from drake_clutter.resources import resource_path
 from drake_clutter.scenes.interfaces import MotionSample, Move, MoveResult, Outcome
 from drake_clutter.scenes.scene import Pose
 from drake_clutter.simulation.scene_plant import pose_from_transform
+from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.messages import PlannedMove
-from drake_clutter.station.station_simulation import STEP_PERIOD, StationSimulation
+from drake_clutter.station.station_simulation import STEP_PERIOD, TIME_STEP, StationSimulation
 from drake_clutter.station.trajectory_file import read_trajectories, write_trajectories
 from drake_clutter.validation import config_yaml
 
@@ -162,6 +164,24 @@ def test_a_fixture_with_a_model_is_an_obstacle(tmp_path: Path) -> None:
     around = CollisionModel(cell, [])
     near = around.distances_below(np.array(cell.robot.home), 1.0)
     assert any("shelf" in clearance.pair for clearance in near)
+
+
+def test_objects_rest_on_a_fixture_with_a_model(tmp_path: Path) -> None:
+    """The model has no hydroelastic properties, and its contact is solid all the same."""
+    path, top = tmp_path / "board.urdf", 0.12
+    path.write_text(BOARD.format(""))
+    cell = with_board(path, top - 0.01)
+    box = resting("cracker_box", floor=top + 0.001)
+    station = ClutterStation(cell, [(box.name, box.object_class)], time_step=TIME_STEP)
+    simulator = Simulator(station)
+    root = simulator.get_mutable_context()
+    home = np.array(cell.robot.home)
+    station.set_state(root, home, [box])
+    station.GetInputPort("command").FixValue(root, [*home, *np.zeros(2 * len(home))])
+    station.GetInputPort("gripper_command").FixValue(root, np.zeros(0))
+    simulator.AdvanceTo(0.4)
+    (X_TO,) = station.scene_plant.poses(station.plant_context(root)).values()
+    assert X_TO.p == pytest.approx(box.X_TO.p - [0.0, 0.0, 0.001], abs=0.0005)
 
 
 STATIC = """<sdf version="1.9"><model name="post"><static>true</static><link name="post">

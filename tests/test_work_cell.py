@@ -101,7 +101,7 @@ def test_depth_beyond_the_range_of_16_bits_is_zero(tmp_path: Path) -> None:
 def test_a_second_tray_may_stand_beside_the_first(tmp_path: Path) -> None:
     """A second tray serves as a bin; its model and link have the names of the support."""
     path = tmp_path / "tray.sdf"
-    path.write_text(support_sdf(tray(0.3)))
+    path.write_text(support_sdf(tray(0.3), table=False))
     cell = cell_with(f"fixtures=[{{name: bin, model: {path}, pose: {{translation: [0, 0.6, 0]}}}}]")
     objects = (resting("sugar_box"), resting("pudding_box", xy=(0.2, 0.0)))
     X_TO_place = objects[0].X_TO.translated((0.0, -0.2, 0.001))

@@ -77,6 +77,8 @@ CELLS = {"one_cup": "ur10_single_cup_tray", "two_cups": "ur10_epick_tray"}
 """Cells of the published episodes. The only cup of the first holds no marker."""
 EXCEPTION = "exception"
 """How an episode ended that raised an exception."""
+_CAUSES = {EXCEPTION, *(reason.value for reason in TerminationReason if reason.is_failed_move)}
+"""Ends of episodes that are causes of failure themselves."""
 
 
 @dataclass(frozen=True)
@@ -296,9 +298,9 @@ def episode_record(task: ExplorationTask, known: Sequence[SceneObject]) -> Row:
     outcomes = [step.outcome for step in task.transitions]
     not_planned = [o.detail for o in outcomes if o.result is MoveResult.NOT_PLANNED]
     collapse = ""
-    if task.transitions and task.termination is TerminationReason.COLLAPSED:
+    if outcomes and outcomes[-1].result.ends_episode:
         last = outcomes[-1]
-        collapse = f"{task.transitions[-1].move}: {last.instability}; {last.detail}"
+        collapse = f"{task.transitions[-1].move}: {last.instability_text}; {last.detail}"
     return {
         "hidden": len(task.initially_hidden),
         "found": len(task.found),
@@ -317,7 +319,7 @@ def episode_record(task: ExplorationTask, known: Sequence[SceneObject]) -> Row:
 
 def failure_cause(episode: Row) -> str:
     """Return why an unsuccessful episode failed."""
-    if episode["ended"] in (EXCEPTION, TerminationReason.COLLAPSED.value):
+    if episode["ended"] in _CAUSES:
         return str(episode["ended"])
     if not episode["arm_can"]:
         return "remaining objects unreachable by suction"

@@ -20,6 +20,9 @@ from drake_clutter.statistics import mean_interval, ratio_interval, wilson_inter
 from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration_task import TerminationReason
 
+_FAILED_MOVES = {reason.value for reason in TerminationReason if reason.is_failed_move}
+"""How episodes end that count as collapsed: an object may have left the support."""
+
 
 @dataclass(frozen=True)
 class EpisodeSpec:
@@ -159,9 +162,7 @@ def summarize_episodes(
             r.ended == TerminationReason.ALL_FOUND.value and r.moves <= limit for r in results
         )
         num_found = [r.found_after[:limit][-1] if r.found_after[:limit] else 0 for r in results]
-        num_collapsed = sum(
-            r.ended == TerminationReason.COLLAPSED.value and r.moves <= limit for r in results
-        )
+        num_collapsed = sum(r.ended in _FAILED_MOVES and r.moves <= limit for r in results)
         row[f"within_{limit}"] = {
             "success": num_successes / len(results),
             "success_ci95": wilson_interval(num_successes, len(results)),

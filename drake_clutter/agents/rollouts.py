@@ -129,7 +129,7 @@ def episode_metrics(rollouts: Sequence[Rollout]) -> dict[str, float]:
     Returns:
         success: Fraction of episodes in which all hidden objects were found.
         found_share: Fraction of all hidden objects that were found.
-        collapsed: Fraction of episodes in which the scene collapsed.
+        collapsed: Fraction of episodes in which the scene collapsed or an object left the support.
         moves_of_successes: Mean number of moves of the successful episodes; 0 without any.
         score: Mean return.
     """
@@ -138,7 +138,7 @@ def episode_metrics(rollouts: Sequence[Rollout]) -> dict[str, float]:
         for rollout in rollouts
         if rollout.termination is TerminationReason.ALL_FOUND
     ]
-    num_collapsed = sum(rollout.termination is TerminationReason.COLLAPSED for rollout in rollouts)
+    num_collapsed = sum(rollout.termination.is_failed_move for rollout in rollouts)
     num_hidden = sum(rollout.num_hidden for rollout in rollouts)
     num_found = sum(rollout.num_found for rollout in rollouts)
     return {

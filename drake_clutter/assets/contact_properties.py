@@ -15,6 +15,8 @@ DISSIPATION = 10.0
 """Hunt-Crossley dissipation, with which objects settle without bouncing [s/m]."""
 SURFACE_FRICTION = 0.5
 """Coulomb coefficient of every surface, static and dynamic."""
+FIXTURE_RESOLUTION = 0.02
+"""Edge length of the contact mesh of curved fixed geometry [m]; boxes and meshes need none."""
 ROLLING_FRICTION = 1e-3
 """Coefficient of rolling friction of exported objects that can roll [m].
 

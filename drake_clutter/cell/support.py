@@ -4,6 +4,7 @@ Frame T: origin at the center of the floor's upper surface, z up. It is the worl
 plants.
 """
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import numpy as np
@@ -39,9 +40,23 @@ class Support(StrictModel):
         """Half the inner extents along x and y [m]. Shape (2,)."""
         return np.array(self.size) / 2
 
+    @property
+    def table_height(self) -> float:
+        """Height of the table under the support, in T [m]."""
+        return -self.floor_thickness - self.floor_height
+
     def contains(self, x: float, y: float) -> bool:
         """Return whether a point (x, y) [m] is within the inner extents."""
         return bool(abs(x) <= self.size[0] / 2 and abs(y) <= self.size[1] / 2)
+
+    def carries(self, p_TP: Sequence[float] | NDArray[np.float64]) -> bool:
+        """Return whether a point is over the floor and not below it.
+
+        Args:
+            p_TP: Point, such as the origin of an object [m]. Shape (3,).
+        """
+        x, y, z = p_TP
+        return self.contains(x, y) and bool(z >= 0)
 
     @property
     def area(self) -> float:

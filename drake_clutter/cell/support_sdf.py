@@ -8,8 +8,16 @@ from drake_clutter.cell.support import Support
 
 FLOOR = "floor"
 """Name of the geometry of the floor."""
+TABLE = "table"
+"""Name of the geometry of the table under a support."""
+_TABLE_SIZE = (2.4, 2.4, 0.04)
+"""Extents of the table [m], those of the shipped cells."""
+_TABLE_GAP = 0.001
+"""Gap between a support that stands on the table and the table, as in the shipped cells [m]: Drake
+is unreliable where faces just touch."""
 _FLOOR_COLOR = "0.72 0.60 0.46 1"
 _WALL_COLOR = "0.55 0.42 0.30 1"
+_TABLE_COLOR = "0.70 0.70 0.70 1"
 _WALL_NAMES = {"+x": "rim_front", "-x": "rim_back", "+y": "rim_left", "-y": "rim_right"}
 """Name of the geometry of each wall."""
 
@@ -53,12 +61,26 @@ def support_boxes(support: Support) -> list[tuple[str, _Vector, _Vector]]:
     ]
 
 
-def support_sdf(support: Support) -> str:
-    """Return the SDF model of a support."""
+def table_box(support: Support) -> tuple[str, _Vector, _Vector]:
+    """Return name, size [m] and center in T [m] of the table under a support."""
+    z = support.table_height - _TABLE_GAP - _TABLE_SIZE[2] / 2
+    return TABLE, _TABLE_SIZE, (0.0, 0.0, z)
+
+
+def support_sdf(support: Support, *, table: bool) -> str:
+    """Return the SDF model of a support.
+
+    Args:
+        support: The support.
+        table: Whether the model includes the table, on which objects lie that left the support. In
+            a work cell, the table is a fixture.
+    """
     boxes = [
         _box(name, size, p_TG, _FLOOR_COLOR if name == FLOOR else _WALL_COLOR)
         for name, size, p_TG in support_boxes(support)
     ]
+    if table:
+        boxes.append(_box(*table_box(support), _TABLE_COLOR))
     return f"""<?xml version="1.0"?>
 <!-- Written by drake_clutter.cell.support_sdf. Origin: center of the floor's upper surface. -->
 <sdf version="1.10" xmlns:drake="drake.mit.edu">

@@ -101,7 +101,7 @@ class WorkCell(StrictModel):
     @property
     def table_height(self) -> float:
         """Height of the table under support and pedestal, in T [m]."""
-        return -self.support.floor_thickness - self.support.floor_height
+        return self.support.table_height
 
     @property
     def pedestal(self) -> tuple[RigidTransform, tuple[float, float, float]] | None:

@@ -209,12 +209,11 @@ def episode_to_dict(task: ExplorationTask, agent: str, fidelity: str, seed: int)
     end = task.termination or TerminationReason.GAVE_UP
     moves = []
     for step in task.transitions:
-        instability = step.outcome.instability
         moves.append(
             {
                 "move": {"pick": step.move.pick, "place": step.move.place},
                 "outcome": step.outcome.result.value,
-                "instability": str(instability) if instability else None,
+                "instability": step.outcome.instability_text or None,
                 "detail": step.outcome.detail,
                 "newly_found": list(step.newly_found),
                 "pick_probabilities": dict(step.decision.pick_probabilities),

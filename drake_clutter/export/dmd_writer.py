@@ -37,7 +37,7 @@ def write_dmd(scene: Scene, folder: Path) -> Path:
         for file in object_class.folder.iterdir():
             # copytree would copy the modes too, which may be read-only in an installed package.
             shutil.copyfile(file, target / file.name)
-    (folder / "tray.sdf").write_text(support_sdf(scene.support), encoding="utf-8")
+    (folder / "tray.sdf").write_text(support_sdf(scene.support, table=True), encoding="utf-8")
     (folder / "package.xml").write_text(_PACKAGE_XML, encoding="utf-8")
     directives = [
         ModelDirective(add_model=AddModel(name=TRAY, file=f"package://{PACKAGE}/tray.sdf")),

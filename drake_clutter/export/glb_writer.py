@@ -25,7 +25,7 @@ ROOT_NODE = "tray_frame"
 def _add_tray(picture: trimesh.Scene, support: Support) -> None:
     """Add the support as a node with one child for each of its boxes."""
     picture.graph.update(frame_to=TRAY, frame_from=ROOT_NODE, matrix=np.eye(4))
-    for tray_box in support_boxes(support):
+    for tray_box in support_boxes(support, table=False):
         box = trimesh.creation.box(tray_box.size)
         # A glTF material is metallic by default.
         material = trimesh.visual.material.PBRMaterial(

@@ -77,9 +77,9 @@ def _add_assets(asset: Element, object_class: ObjectClass, pieces: Sequence[str]
 
 
 def _add_tray(worldbody: Element, support: Support) -> None:
-    """Add the support as a fixed body."""
+    """Add the support and the table under it as a fixed body."""
     tray = SubElement(worldbody, "body", name=TRAY)
-    for box in support_boxes(support):
+    for box in support_boxes(support, table=True):
         geometry = {
             "type": "box",
             "size": format_numbers(box.size / 2),

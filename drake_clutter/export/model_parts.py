@@ -106,10 +106,10 @@ def load_visual(object_class: ObjectClass) -> Any:
     return mesh
 
 
-def support_boxes(support: Support) -> list[SupportBox]:
+def support_boxes(support: Support, *, table: bool) -> list[SupportBox]:
     """Return the boxes of a support."""
     boxes = []
-    for visual in ElementTree.fromstring(support_sdf(support)).iter("visual"):
+    for visual in ElementTree.fromstring(support_sdf(support, table=table)).iter("visual"):
         pose, size, color = (
             np.array([float(value) for value in visual.findtext(path, "").split()])
             for path in ("pose", "geometry/box/size", "material/diffuse")

@@ -126,7 +126,7 @@ def write_sdf(scene: Scene, folder: Path) -> Path:
         write_class_meshes(object_class, folder)
     root = ElementTree.Element("sdf", version="1.10")
     world = ElementTree.SubElement(root, "world", name="scene")
-    tray = _model(support_sdf(scene.support), TRAY)
+    tray = _model(support_sdf(scene.support, table=True), TRAY)
     static = ElementTree.Element("static")
     static.text = "1"  # PyBullet does not accept "true"
     tray.insert(0, static)

@@ -18,7 +18,7 @@ from drake_clutter.reports.detection_image import draw_detections
 from drake_clutter.reports.filmstrip import render_frames, select_key_frames
 from drake_clutter.reports.recording import episode_frames, write_recording
 from drake_clutter.reports.scene_images import Annotations, Highlight, SceneRenderer, display_name
-from drake_clutter.scenes.interfaces import Instability, Move, MoveResult
+from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Move, MoveResult
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
 from drake_clutter.tasks.exploration_task import Transition
 
@@ -35,7 +35,12 @@ _LEGEND = {
     Highlight.VISIBLE: "in view; the number is that of its name",
 }
 _DASHED = (Highlight.HIDDEN, Highlight.OCCLUDED)
-_BADGES = {MoveResult.PLACED: "good", MoveResult.COLLAPSED: "bad", MoveResult.DROPPED: "bad"}
+_BADGES = {
+    MoveResult.PLACED: "good",
+    MoveResult.COLLAPSED: "bad",
+    MoveResult.LEFT_TRAY: "bad",
+    MoveResult.DROPPED: "bad",
+}
 _LABELS = {
     "agent": "Policy",
     "seed": "Random seed",
@@ -216,7 +221,7 @@ def _notes_html(step: Transition) -> str:
         notes = [f"Newly found: <strong>{escape(_display_names(step.newly_found))}</strong>."]
     notes.append(f"Reward {step.reward:+g}.")
     if outcome.instability:
-        notes.append(f"{escape(_instability_text(outcome.instability))}.")
+        notes.append(f"{escape(_instability_text(outcome.instability, outcome.scene))}.")
     if outcome.detail:
         notes.append(f"{escape(outcome.detail[:1].upper() + outcome.detail[1:])}.")
     return " ".join(notes)
@@ -440,8 +445,11 @@ def _move_text(move: Move) -> str:
     return f"{display_name(move.pick)} \N{RIGHTWARDS ARROW} {place}"
 
 
-def _instability_text(instability: Instability) -> str:
+def _instability_text(instability: Instability, after: Scene) -> str:
     displacement = f"moved {1000 * instability.displacement:.0f} mm"
     tilt = f"tilted {np.degrees(instability.tilt):.0f}\N{DEGREE SIGN}"
     name = display_name(instability.object)
-    return f"{name}: {instability.reason.value} ({displacement}, {tilt})"
+    place = ""
+    if instability.reason is InstabilityReason.LEFT_TRAY:
+        place = f", and is at {after[instability.object].X_TO.place_text}"
+    return f"{name}: {instability.reason.value} ({displacement}, {tilt}){place}"

@@ -179,6 +179,7 @@ class MoveResult(Enum):
     Attributes:
         PLACED: The object is at its placement, and the scene is stable.
         COLLAPSED: The scene is unstable after the move.
+        LEFT_TRAY: An object fell off the support.
         NO_FREE_PLACEMENT: No placement is known to be free.
         INCONCLUSIVE: The executor's model does not cover the scene.
         NOT_PLANNED: No motion plan was found.
@@ -187,6 +188,7 @@ class MoveResult(Enum):
 
     PLACED = "placed"
     COLLAPSED = "collapsed"
+    LEFT_TRAY = "left the tray"
     NO_FREE_PLACEMENT = "no free spot"
     INCONCLUSIVE = "cannot be judged"
     NOT_PLANNED = "not planned"
@@ -195,7 +197,18 @@ class MoveResult(Enum):
     @property
     def was_executed(self) -> bool:
         """Whether anything was moved."""
-        return self in (MoveResult.PLACED, MoveResult.COLLAPSED, MoveResult.DROPPED)
+        return self in (MoveResult.PLACED, MoveResult.DROPPED) or self.ends_episode
+
+    @property
+    def ends_episode(self) -> bool:
+        """Whether the move ruined the scene."""
+        return self in (MoveResult.COLLAPSED, MoveResult.LEFT_TRAY)
+
+    @staticmethod
+    def of_instability(instability: Instability) -> "MoveResult":
+        """Return the result of a move that made an object fall."""
+        left_tray = instability.reason is InstabilityReason.LEFT_TRAY
+        return MoveResult.LEFT_TRAY if left_tray else MoveResult.COLLAPSED
 
 
 @dataclass(frozen=True)
@@ -237,7 +250,7 @@ class Outcome:
     Attributes:
         result: How the move ended.
         scene: The scene after the move; the scene before it if nothing was moved.
-        instability: The failed object of a collapsed scene.
+        instability: The failed object of a collapsed scene, or the object that left the support.
         motion: Recorded motion of the whole move, or without an arm, of the scene after the
             release.
         inconclusive: What the executor's model does not cover, if that is the result.
@@ -252,6 +265,17 @@ class Outcome:
     inconclusive: InconclusiveVerdict | None = None
     detail: str = ""
     X_TO_released: Pose | None = None
+
+    @property
+    def instability_text(self) -> str:
+        """The failed object, how it failed, and where it is if it left the support; else ""."""
+        if self.instability is None:
+            return ""
+        if self.result is not MoveResult.LEFT_TRAY:
+            return str(self.instability)
+        return (
+            f"{self.instability}, and is at {self.scene[self.instability.object].X_TO.place_text}"
+        )
 
 
 @dataclass(frozen=True)

@@ -58,6 +58,12 @@ class Pose:
         """Translation p_AB as an array [m]. Shape (3,)."""
         return np.asarray(self.translation)
 
+    @property
+    def place_text(self) -> str:
+        """Translation p_AB for readers, to the millimeter."""
+        x, y, z = self.translation
+        return f"({x:.3f}, {y:.3f}, {z:.3f}) m"
+
     def apply(self, p_B: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return points given in B, expressed in A.
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import Box, SceneGraph, Sphere
+from pydrake.geometry import Box, RoleAssign, SceneGraph, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction, MultibodyPlant
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import Frame, ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import Context, DiagramBuilder
 
@@ -22,6 +22,7 @@ from drake_clutter.files import InputError
 from drake_clutter.robots.model_parsing import parse_model
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.robots.robot_plant import PEDESTAL_NAME, add_robot, filter_collisions
+from drake_clutter.simulation.scene_plant import FRICTION, rigid_contact_properties
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ def add_work_cell(
     fixed = [plant.world_body()]
     for fixture in cell.fixtures:
         if fixture.box is None:
-            fixed += _add_model(plant, fixture, visuals=visuals)
+            fixed += _add_model(plant, scene_graph, fixture, visuals=visuals)
         else:
             shape = Box(*fixture.box)
             _add_solid(plant, fixture.name, fixture.pose.transform, shape, fixture.color)
@@ -136,12 +137,14 @@ def _add_solid(
 ) -> None:
     """Add a shape that is fixed to the world, with visual geometry if it has a color."""
     world = plant.world_body()
-    plant.RegisterCollisionGeometry(world, X_TS, shape, name, CoulombFriction(0.5, 0.5))
+    plant.RegisterCollisionGeometry(world, X_TS, shape, name, rigid_contact_properties(FRICTION))
     if color is not None:
         plant.RegisterVisualGeometry(world, X_TS, shape, name, np.array(color))
 
 
-def _add_model(plant: MultibodyPlant, fixture: Fixture, *, visuals: bool) -> tuple[RigidBody, ...]:
+def _add_model(
+    plant: MultibodyPlant, scene_graph: SceneGraph, fixture: Fixture, *, visuals: bool
+) -> tuple[RigidBody, ...]:
     """Add a fixture's model, fixed to the world, and return its bodies.
 
     `fixture_name` returns the fixture's name for each of these bodies.
@@ -162,7 +165,23 @@ def _add_model(plant: MultibodyPlant, fixture: Fixture, *, visuals: bool) -> tup
     joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
     if len(joints) != len(bodies) or any(joint.num_positions() for joint in joints):
         raise InputError(f"{field}: {fixture.model!r} has movable joints; expected a rigid model")
+    _complete_contact_properties(plant, scene_graph, bodies)
     return bodies
+
+
+def _complete_contact_properties(
+    plant: MultibodyPlant, scene_graph: SceneGraph, bodies: Sequence[RigidBody]
+) -> None:
+    """Make geometry of fixed bodies rigid hydroelastic where the model does not declare it."""
+    inspector = scene_graph.model_inspector()
+    for body in bodies:
+        for geometry in plant.GetCollisionGeometriesForBody(body):
+            own = inspector.GetProximityProperties(geometry)
+            if own.HasProperty("hydroelastic", "compliance_type"):
+                continue
+            friction = own.GetProperty("material", "coulomb_friction")
+            properties = rigid_contact_properties(friction)
+            scene_graph.AssignRole(plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
 
 
 def joint_state_indices(

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.support import Support
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
-from drake_clutter.simulation.scene_plant import add_scene_plant
+from drake_clutter.simulation.scene_plant import add_scene_plant, add_table
 
 _START_RANGE = 0.3
 """Largest start distance from the center, as a fraction of the support's size.
@@ -63,6 +63,7 @@ def simulate_drop(scene: Scene, time_step: float, times: Sequence[float]) -> lis
     builder = DiagramBuilder()
     names = [(o.name, o.object_class) for o in scene.objects]
     scene_plant = add_scene_plant(builder, names, scene.support, time_step, visuals=False)
+    add_table(scene_plant.plant, scene.support)
     scene_plant.plant.Finalize()
     simulator = Simulator(builder.Build())
     context = scene_plant.plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
@@ -72,12 +73,6 @@ def simulate_drop(scene: Scene, time_step: float, times: Sequence[float]) -> lis
     for time in times:
         simulator.AdvanceTo(time)
         snapshot = scene.with_poses(scene_plant.poses(context))
-        on_tray = tuple(o for o in snapshot.objects if _on_tray(o, scene.support))
+        on_tray = tuple(o for o in snapshot.objects if scene.support.carries(o.X_TO.translation))
         scenes.append(Scene(on_tray, scene.support))
     return scenes
-
-
-def _on_tray(scene_object: SceneObject, support: Support) -> bool:
-    """Return whether an object's origin is over the support and above its floor."""
-    x, y, z = scene_object.X_TO.translation
-    return support.contains(x, y) and z > 0

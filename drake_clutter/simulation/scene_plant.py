@@ -4,17 +4,33 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.geometry import SceneGraph
+from pydrake.geometry import (
+    AddContactMaterial,
+    AddRigidHydroelasticProperties,
+    Box,
+    ProximityProperties,
+    SceneGraph,
+)
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.plant import (
+    AddMultibodyPlant,
+    CoulombFriction,
+    MultibodyPlant,
+    MultibodyPlantConfig,
+)
 from pydrake.multibody.tree import QuaternionFloatingJoint, RigidBody
 from pydrake.systems.framework import Context, DiagramBuilder
 
+from drake_clutter.assets.contact_properties import (
+    DISSIPATION,
+    FIXTURE_RESOLUTION,
+    SURFACE_FRICTION,
+)
 from drake_clutter.catalog import ObjectClass, RestOrientation, Shape
 from drake_clutter.cell.sdf_text import read_sdf_text
 from drake_clutter.cell.support import Support
-from drake_clutter.cell.support_sdf import support_sdf
+from drake_clutter.cell.support_sdf import support_sdf, table_box
 from drake_clutter.scenes.scene import Pose, SceneObject
 
 ROLLING_DAMPING_TIME = 0.05
@@ -78,6 +94,37 @@ class ScenePlant:
         }
 
 
+FRICTION = CoulombFriction(SURFACE_FRICTION, SURFACE_FRICTION)
+"""Friction of every surface."""
+
+
+def rigid_contact_properties(friction: CoulombFriction) -> ProximityProperties:
+    """Return the contact properties of fixed geometry.
+
+    Objects are compliant. Without hydroelastic properties on the other side, their contact has a
+    single point, through which a box sinks while it rocks.
+
+    Args:
+        friction: Friction of the surface.
+    """
+    properties = ProximityProperties()
+    AddRigidHydroelasticProperties(FIXTURE_RESOLUTION, properties)
+    AddContactMaterial(dissipation=DISSIPATION, friction=friction, properties=properties)
+    return properties
+
+
+def add_table(plant: MultibodyPlant, support: Support) -> None:
+    """Add the table under a support, where objects lie that left it, to a plant without a cell."""
+    name, size, p_TG = table_box(support)
+    plant.RegisterCollisionGeometry(
+        plant.world_body(),
+        RigidTransform(p_TG),
+        Box(*size),
+        name,
+        rigid_contact_properties(FRICTION),
+    )
+
+
 def get_support_body(plant: MultibodyPlant) -> RigidBody:
     """Return the body of the support; models may have other bodies of the same name."""
     return plant.GetBodyByName("tray", plant.GetModelInstanceByName("tray"))
@@ -134,7 +181,7 @@ def add_objects(
         visuals: See `add_scene_plant`.
         object_with_joint: See `add_scene_plant`.
     """
-    (tray,) = Parser(plant).AddModelsFromString(support_sdf(support), "sdf")
+    (tray,) = Parser(plant).AddModelsFromString(support_sdf(support, table=False), "sdf")
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("tray", tray))
     bodies = {}
     for name, object_class in objects:

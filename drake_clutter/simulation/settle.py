@@ -13,7 +13,7 @@ from drake_clutter.cell.support import Support
 from drake_clutter.config import SettleConfig
 from drake_clutter.scenes.interfaces import Instability, InstabilityReason, MotionSample
 from drake_clutter.scenes.scene import Pose, SceneObject, tilt_between
-from drake_clutter.simulation.scene_plant import add_scene_plant
+from drake_clutter.simulation.scene_plant import add_scene_plant, add_table
 
 SAMPLE_PERIOD = 0.05
 """Time between two checks for rest [s]; every second check also looks for falls."""
@@ -49,8 +49,7 @@ def find_instability(
     """
     displacement = _distance(after, before.X_TO)
     tilt = tilt_between(before.object_class, before.X_TO, after)
-    x, y, z = after.translation
-    if not support.contains(x, y) or z < 0:
+    if not support.carries(after.translation):
         reason = InstabilityReason.LEFT_TRAY
     elif tilt >= math.radians(config.max_tilt_deg):
         reason = InstabilityReason.TOPPLED
@@ -91,6 +90,7 @@ def settle(
         config.time_step,
         visuals=False,
     )
+    add_table(scene_plant.plant, support)
     scene_plant.plant.Finalize()
     simulator = Simulator(builder.Build())
     context = scene_plant.plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())

@@ -74,7 +74,7 @@ class SettleExecutor:
                 else:
                     poses, motion = settled[-1].poses, _merge_motions(moved.poses, settled)
                 return Outcome(
-                    MoveResult.COLLAPSED,
+                    MoveResult.of_instability(settled[-1].instability),
                     moved.with_poses(poses),
                     settled[-1].instability,
                     motion,

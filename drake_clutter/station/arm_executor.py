@@ -11,7 +11,13 @@ from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailur
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.scenes.geometry import group_touching_objects
-from drake_clutter.scenes.interfaces import Instability, MoveResult, Outcome, PickPlaceCommand
+from drake_clutter.scenes.interfaces import (
+    Instability,
+    InstabilityReason,
+    MoveResult,
+    Outcome,
+    PickPlaceCommand,
+)
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.simulation.drake_judge import TOUCHING_MARGIN
 from drake_clutter.simulation.settle import find_instability, settle
@@ -30,7 +36,8 @@ class ArmExecutor:
     A move is planned, simulated along the whole trajectory, and evaluated. Objects that were
     disturbed are settled afterwards, as `DrakeJudge` settles a scene. The scene has collapsed
     if an object exceeds the limits of displacement or tilt: the picked object relative to its
-    release pose, any other relative to its pose before the move.
+    release pose, any other relative to its pose before the move. An object that leaves the support
+    is a result of its own, also if the gripper dropped it.
     """
 
     def __init__(
@@ -95,7 +102,15 @@ def evaluate_outcome(
     expected = before.with_poses({pick: X_TO_place})
     # An object that detaches at touchdown and stays at its place pose counts as placed.
     dropped = lost_object and worst_instability([expected[pick]], after, config) is not None
-    checked = [o for o in expected.objects if o.name != pick or not dropped]
+    support = before.support
+    # Only the move at which an object leaves the support is blamed for it.
+    on_support = {o.name for o in before.objects if support.carries(o.X_TO.translation)}
+    is_picked_lost = dropped and support.carries(after[pick].X_TO.translation)
+    checked = [
+        o
+        for o in expected.objects
+        if (not is_picked_lost if o.name == pick else o.name in on_support)
+    ]
     instability = worst_instability(checked, after, config)
     if instability is None and not dropped:
         disturbed = {
@@ -105,18 +120,18 @@ def evaluate_outcome(
         } | {pick}
         for group in group_touching_objects(after.objects, TOUCHING_MARGIN):
             if not disturbed.isdisjoint(o.name for o in group):
-                after = after.with_poses(settle(group, before.support, config).poses)
+                after = after.with_poses(settle(group, support, config).poses)
         instability = worst_instability(checked, after, config)
     result = MoveResult.DROPPED if dropped else MoveResult.PLACED
     if instability is not None:
-        result = MoveResult.COLLAPSED
+        result = MoveResult.of_instability(instability)
     return Outcome(result, after, instability, X_TO_released=X_TO_place)
 
 
 def worst_instability(
     expected: Sequence[SceneObject], after: Scene, config: SettleConfig
 ) -> Instability | None:
-    """Return the instability with the largest displacement, or None if all are stable.
+    """Return an object that left the support, or else the largest displacement, or None.
 
     Args:
         expected: Objects at their expected poses.
@@ -128,4 +143,8 @@ def worst_instability(
         for o in expected
         if (instability := find_instability(o, after[o.name].X_TO, after.support, config))
     ]
-    return max(instabilities, key=lambda instability: instability.displacement, default=None)
+    return max(
+        instabilities,
+        key=lambda found: (found.reason is InstabilityReason.LEFT_TRAY, found.displacement),
+        default=None,
+    )

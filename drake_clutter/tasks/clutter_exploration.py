@@ -11,7 +11,7 @@ from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, format_value
 from drake_clutter.resources import resource_path
-from drake_clutter.scenes.interfaces import Move, MoveResult
+from drake_clutter.scenes.interfaces import Move
 from drake_clutter.scenes.scene import TRAY, Scene, SceneObject
 from drake_clutter.scenes.scene_dataset import SceneDataset, load_scene_dataset, relayout
 from drake_clutter.stability.static_judge import StaticStabilityJudge
@@ -54,13 +54,15 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
     `flat_actions`, `Discrete(N * N)`, the number x * N + y. `action_mask` of the observation marks
     the allowed moves; any other changes nothing, but counts as a move.
 
-    Reward: `detection_reward` per newly detected object; `collapse_penalty` if the scene collapses.
+    Reward: `detection_reward` per newly detected object; `collapse_penalty` if the scene collapses
+    or an object leaves the support.
 
-    Termination: all objects have been detected, or the scene has collapsed. Truncation: after
-    `max_moves` moves, or if no move is allowed.
+    Termination: all objects have been detected, the scene has collapsed, or an object has left the
+    support. Truncation: after `max_moves` moves, or if no move is allowed.
 
     The `info` of a step has the `transition` (a `Transition`) if the move was allowed, and at the
-    end of an episode the `termination` (a `TerminationReason`).
+    end of an episode the `termination` (a `TerminationReason`). The outcome of the transition names
+    the object that fell, and its scene has the poses at the end.
     """
 
     metadata: dict[str, Any] = RENDER_METADATA
@@ -271,7 +273,7 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
             return self.observe(), 0.0, False, truncated, masked_info
         move = Move(names[x - 1], names[y - 1] if y else TRAY)
         outcome = self.backend.step(move)
-        if outcome.result is not MoveResult.COLLAPSED:
+        if not outcome.result.ends_episode:
             self.backend.update_belief()
         transition = self.task.record(MoveAttempt(Decision(move), outcome, self.backend.perception))
         observation = self._observe_and_keep_mask()
@@ -280,7 +282,9 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
             termination = TerminationReason.OUT_OF_MOVES
         if termination is None and not observation["action_mask"].any():
             termination = TerminationReason.GAVE_UP
-        terminated = termination in (TerminationReason.ALL_FOUND, TerminationReason.COLLAPSED)
+        terminated = termination is not None and (
+            termination is TerminationReason.ALL_FOUND or termination.is_failed_move
+        )
         truncated = termination is not None and not terminated
         info: dict[str, Any] = {"transition": transition}
         if termination is not None:

@@ -19,14 +19,21 @@ class TerminationReason(Enum):
 
     - `ALL_FOUND`: Every object has been in view.
     - `COLLAPSED`: The latest move made the scene collapse.
+    - `LEFT_TRAY`: An object fell off the support at the latest move.
     - `OUT_OF_MOVES`: The maximum number of moves was reached.
     - `GAVE_UP`: The policy has no further move.
     """
 
     ALL_FOUND = "all found"
-    COLLAPSED = "collapsed"
+    COLLAPSED = MoveResult.COLLAPSED.value
+    LEFT_TRAY = MoveResult.LEFT_TRAY.value
     OUT_OF_MOVES = "out of moves"
     GAVE_UP = "gave up"
+
+    @property
+    def is_failed_move(self) -> bool:
+        """Whether the latest move ruined the scene."""
+        return self in (TerminationReason.COLLAPSED, TerminationReason.LEFT_TRAY)
 
 
 @dataclass(frozen=True)
@@ -59,7 +66,7 @@ class Transition(MoveAttempt):
         newly_found: Names of the objects that were detected for the first time, in the order of
             the scene's objects.
         reward: `detection_reward` per newly found object, plus `collapse_penalty` if the scene
-            collapsed.
+            collapsed or an object left the support.
     """
 
     newly_found: tuple[str, ...]
@@ -69,9 +76,9 @@ class Transition(MoveAttempt):
 class ExplorationTask:
     """Ground-truth record of an exploration episode.
 
-    An episode ends when every object has been in view, when the scene collapses, or after a maximum
-    number of moves. Objects that a collapse uncovers do not count as found. A move that could not
-    be carried out counts as a move.
+    An episode ends when every object has been in view, when the scene collapses or an object leaves
+    the support, or after a maximum number of moves. Objects that such a move uncovers do not count
+    as found. A move that could not be carried out counts as a move.
 
     Attributes:
         initial_scene: The scene at the start.
@@ -116,8 +123,8 @@ class ExplorationTask:
 
         `GAVE_UP` is never returned, because the task does not observe the policy.
         """
-        if self.transitions and self.transitions[-1].outcome.result is MoveResult.COLLAPSED:
-            return TerminationReason.COLLAPSED
+        if self.transitions and self.transitions[-1].outcome.result.ends_episode:
+            return TerminationReason(self.transitions[-1].outcome.result.value)
         if len(self.detected) == len(self.scene.objects):
             return TerminationReason.ALL_FOUND
         return TerminationReason.OUT_OF_MOVES if len(self.transitions) >= self._max_moves else None
@@ -131,23 +138,24 @@ class ExplorationTask:
         """Record an attempted move, and return it with its reward.
 
         Raises:
-            ValueError: The scene has collapsed. After any other termination, an episode may
-                continue.
+            ValueError: The scene has collapsed or an object left the support. After any other
+                termination, an episode may continue.
         """
-        if self.termination is TerminationReason.COLLAPSED:
-            raise ValueError("the scene has collapsed; no further move can be recorded")
-        has_collapsed = attempt.outcome.result is MoveResult.COLLAPSED
+        if self.termination is not None and self.termination.is_failed_move:
+            reason = self.termination.value
+            raise ValueError(f"the episode has ended ({reason}); no further move can be recorded")
+        has_failed = attempt.outcome.result.ends_episode
         self.scene = attempt.outcome.scene
         self.perception = attempt.next_perception
         in_view = {d.name for d in self.perception.observation.detections}
         newly_found = tuple(
             name
             for name in self.scene.names
-            if name in in_view and name not in self.detected and not has_collapsed
+            if name in in_view and name not in self.detected and not has_failed
         )
         self.detected += newly_found
         reward = self._config.detection_reward * len(newly_found)
-        reward += self._config.collapse_penalty if has_collapsed else 0.0
+        reward += self._config.collapse_penalty if has_failed else 0.0
         transition = Transition(
             attempt.decision, attempt.outcome, attempt.next_perception, newly_found, reward
         )
