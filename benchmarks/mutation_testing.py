@@ -13,13 +13,14 @@ code, and compiling every mutant takes longer than interpreting small cases.
 """
 
 import hashlib
+import importlib.util
 import json
 import os
 import subprocess
 import sys
 import threading
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +31,7 @@ import typer
 
 from benchmarks.mutation_operators import Mutant, find_mutants, rank
 from benchmarks.mutation_worker import NOT_REPLACED, Job, Result
-from drake_clutter.files import write_json
+from drake_clutter.files import InputError, write_json
 from training.results_file import ResultsFile, Row, provenance
 from training.script import (
     ROOT,
@@ -326,18 +327,28 @@ def cover(
     out: Annotated[Path, typer.Option("--out", metavar="FOLDER", help="Folder of the coverage.")],
     workers: WorkersOption = 1,
 ) -> None:
-    """Record which lines each test executes. Test files that are in the folder are skipped."""
+    """Record which lines each test executes.
+
+    Test files are skipped if neither they nor the modules they execute have changed.
+    """
+    if importlib.util.find_spec("coverage") is None:
+        raise InputError("the package coverage is missing; install it with pip")
     for compiled in (False, True):
         folder = out / ("compiled" if compiled else "interpreted")
         folder.mkdir(parents=True, exist_ok=True)
         files = test_files(compiled=compiled)
         measured = [path for path in module_files() if is_compiled(path) != compiled]
-        job = {"measured": measured, "test_limit": TEST_LIMIT, "time_limit": 1200.0, "limits": None}
+        job: Job = {
+            "measured": measured,
+            "test_limit": TEST_LIMIT,
+            "time_limit": 1200.0,
+            "limits": None,
+        }
         for kind, jobs in (
             ("fresh", {"imports": job | {"files": files, "limits": {}}}),
             ("collected", {Path(file).stem: job | {"files": [file]} for file in files}),
         ):
-            missing = [name for name in jobs if not (folder / f"{name}.json").exists()]
+            missing = [name for name in jobs if not is_current(folder / f"{name}.json")]
             if not missing:
                 continue
             with worker_pool(min(workers, len(missing)), kind, files, compiled=compiled) as pool:
@@ -346,7 +357,16 @@ def cover(
                     if "failure" in result:
                         print(f"{missing[index]}: {result['failure']}", file=sys.stderr)
                     else:
-                        write_json(folder / f"{missing[index]}.json", result)
+                        blobs = git_blobs([*jobs[missing[index]]["files"], *result["lines"]])
+                        write_json(folder / f"{missing[index]}.json", result | {"blobs": blobs})
+
+
+def is_current(path: Path) -> bool:
+    """Return whether a file of coverage exists and the files that it measured are unchanged."""
+    if not path.exists():
+        return False
+    blobs = json.loads(path.read_text())["blobs"]
+    return all((ROOT / name).exists() for name in blobs) and git_blobs(blobs) == blobs
 
 
 def sample_mutants(count: int, seed: int) -> list[Mutant]:
@@ -377,10 +397,17 @@ def mutant_job(mutant: Mutant, covered: TestCoverage) -> Job:
     }
 
 
-def git_blob(path: Path) -> str:
-    """Return the abbreviated name of a file's content in Git, as `git hash-object` does."""
-    content = path.read_bytes()
-    return hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()[:12]
+def git_blobs(paths: Iterable[str]) -> dict[str, str]:
+    """Return the abbreviated names of files' contents in Git, as `git hash-object` does.
+
+    Args:
+        paths: Paths from the root of the repository.
+    """
+    contents = {path: (ROOT / path).read_bytes() for path in paths}
+    return {
+        path: hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()[:12]
+        for path, content in contents.items()
+    }
 
 
 def mutant_row(mutant: Mutant, result: Result, num_executing: int) -> Row:
@@ -403,7 +430,7 @@ def mutant_row(mutant: Mutant, result: Result, num_executing: int) -> Row:
         "caught_by": caught_by,
         "tests": len(outcomes),
         "tests_of_the_line": num_executing,
-        "blob": git_blob(ROOT / mutant.path),
+        "blob": git_blobs([mutant.path])[mutant.path],
     }
 
 
@@ -422,14 +449,28 @@ def run(
     ] = False,
     out: ResultsOption = None,
 ) -> None:
-    """Sample mutants and test those that the results file lacks."""
+    """Sample mutants and test those that the results file lacks.
+
+    The sample is drawn anew from the code as it is. A mutant whose line has not changed has the
+    same key, and its result is kept. One whose line has changed leaves the sample, its result is
+    removed, and the next mutant in the order of the seed takes its place.
+    """
     out = out or ROOT / "benchmarks/results/mutation_testing.json"
     results = ResultsFile(out, {"seed": seed, "count": count}, ("key",))
     software = provenance()
+    sample = sample_mutants(count, seed)
+    num_removed = results.keep({(mutant.key,) for mutant in sample})
     known = {row["key"]: row["outcome"] for row in results.read()}
+    outdated = [path for path in coverage.glob("*/*.json") if not is_current(path)]
+    print(
+        f"{num_removed} results removed: their mutants are no longer in the sample\n"
+        f"{len(known)} of {count} mutants have results; "
+        f"{len(outdated)} files of coverage are outdated" + "; run `cover`" * bool(outdated),
+        file=sys.stderr,
+    )
     missing = [
         mutant
-        for mutant in sample_mutants(count, seed)
+        for mutant in sample
         if (mutant.key not in known or (again and known[mutant.key] == "survived"))
         and (not group or module_files()[mutant.path] in group)
     ]

@@ -72,8 +72,8 @@ NOT_REPLACED = "the function cannot be replaced"
 """Failure of a job whose function is not found, or has other enclosed variables."""
 OPTIONS = ("-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist")
 """Options of pytest."""
-WAITING_FACTOR = 30
-"""Ratio of the waiting time for a process to the limit of its processor time."""
+IDLE_TIME = 60.0
+"""Time after which a process that neither runs nor waits for a processor is ended [s]."""
 
 
 class MutatedModule(MetaPathFinder):
@@ -305,27 +305,65 @@ def run_job(job: Job, run: Callable[[Job], Result]) -> Result:
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY_LIMIT, MEMORY_LIMIT))
         seconds = int(job["time_limit"])
         resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
+        try:
+            result = run(job)
+        except Exception as error:
+            result = {"failure": f"{type(error).__name__}: {error}"}
         with os.fdopen(writing, "w") as stream:
-            json.dump(run(job), stream)
+            json.dump(result, stream)
         os._exit(0)
     os.close(writing)
-    answer = b""
-    deadline = time.monotonic() + WAITING_FACTOR * job["time_limit"]
-    while select.select([reading], [], [], max(deadline - time.monotonic(), 0))[0]:
-        block = os.read(reading, 1 << 16)
-        answer += block
-        if not block:
-            break
+    answer = _read_until_idle(reading, child)
     with suppress(ProcessLookupError):
         os.killpg(child, signal.SIGKILL)
     _, status = os.waitpid(child, 0)
     os.close(reading)
     shutil.rmtree(folder, ignore_errors=True)
     try:
-        result: Result = json.loads(answer)
+        received: Result = json.loads(answer)
     except json.JSONDecodeError:
         return {"failure": f"process ended with status {status}"}
-    return result
+    return received
+
+
+def _read_until_idle(reading: int, child: int) -> bytes:
+    """Return what a process group writes into a pipe, until the pipe is closed or the group idles.
+
+    A group idles if none of its processes has run, or waited for a processor, for `IDLE_TIME`. On a
+    loaded machine a process may wait for long.
+
+    Args:
+        reading: Descriptor of the pipe.
+        child: Identifier of the process group.
+    """
+    answer = b""
+    seconds, idle_since = -1.0, time.monotonic()
+    while time.monotonic() - idle_since < IDLE_TIME:
+        if select.select([reading], [], [], 1.0)[0]:
+            block = os.read(reading, 1 << 16)
+            answer += block
+            if not block:
+                break
+        states = group_states(child)
+        used = sum(states.values())
+        if used != seconds or any(state == "R" for _, state in states):
+            seconds, idle_since = used, time.monotonic()
+    return answer
+
+
+def group_states(group: int) -> dict[tuple[int, str], float]:
+    """Return the processor times of the processes of a group [s], by identifier and state.
+
+    The state is a letter of Linux, such as R for running and S for sleeping.
+    """
+    ticks = os.sysconf("SC_CLK_TCK")
+    states = dict[tuple[int, str], float]()
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):  # The process has ended.
+            fields = path.read_text().rpartition(")")[2].split()
+            if int(fields[2]) == group:
+                states[int(path.parent.name), fields[0]] = sum(map(int, fields[11:13])) / ticks
+    return states
 
 
 def main() -> None:
@@ -342,8 +380,9 @@ def main() -> None:
         for line in sys.stdin:
             job = json.loads(line)
             result = run_job(job, run)
-            if result.get("is_too_slow") and "source" in job:
-                # Perhaps because it compiled functions, which are in the cache from then on.
+            if (result.get("is_too_slow") or "failure" in result) and "source" in job:
+                # Perhaps because it compiled functions, which are in the cache from then on, or
+                # because memory was short.
                 result = run_job(job, run)
             print(json.dumps(result), file=results)
 

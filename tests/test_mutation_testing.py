@@ -2,12 +2,25 @@
 
 import ast
 import json
+import os
+import subprocess
+import time
 from importlib.util import module_from_spec
 from pathlib import Path
 
 from benchmarks.mutation_operators import find_mutants, rank
-from benchmarks.mutation_testing import TestCoverage, mutant_row
-from benchmarks.mutation_worker import MutatedModule, existing_functions, replace_code
+from benchmarks.mutation_testing import TestCoverage, git_blobs, is_current, mutant_row
+from benchmarks.mutation_worker import (
+    Job,
+    MutatedModule,
+    Result,
+    existing_functions,
+    group_states,
+    replace_code,
+    run_job,
+)
+from training.results_file import ResultsFile
+from training.script import ROOT
 
 SOURCE = '''"""Module."""
 LIMITS: dict[str, float] = {"ä": 0.5}
@@ -150,3 +163,46 @@ def test_a_module_is_imported_with_another_source() -> None:
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
     assert module.VALUE == 5
+
+
+def test_an_exception_in_the_process_of_a_job_is_its_result() -> None:
+    def run(job: Job) -> Result:
+        if job["files"]:
+            raise ValueError("no tests")
+        return {"outcomes": {}}
+
+    job = {"time_limit": 60.0, "files": []}
+    assert run_job(job, run) == {"outcomes": {}}
+    assert run_job(job | {"files": ["a"]}, run) == {"failure": "ValueError: no tests"}
+
+
+def test_processor_times_of_a_process_group() -> None:
+    before = time.process_time()
+    states = group_states(os.getpgrp())
+    assert before - 0.1 < states[os.getpid(), "R"] < time.process_time() + 0.1
+    assert group_states(os.getpid() + 1_000_000_000) == {}
+
+
+def test_coverage_is_outdated_when_a_measured_file_changes(tmp_path: Path) -> None:
+    path, name = tmp_path / "test_nnls.json", "drake_clutter/stability/nnls.py"
+    assert not is_current(path)
+    content = (ROOT / name).read_bytes()
+    blob = subprocess.run(
+        ["git", "hash-object", "--stdin"], input=content, capture_output=True, check=True
+    ).stdout.decode()
+    assert git_blobs([name]) == {name: blob[:12]}
+    for blobs, expected in (
+        ({name: blob[:12]}, True),
+        ({name: "0" * 12}, False),
+        ({name: blob[:12], "no_such_file.py": blob[:12]}, False),
+    ):
+        path.write_text(json.dumps({"blobs": blobs}))
+        assert is_current(path) == expected
+
+
+def test_results_outside_the_sample_are_removed(tmp_path: Path) -> None:
+    results = ResultsFile(tmp_path / "results.json", {"seed": 0}, ("key",))
+    assert results.keep([("a",)]) == 0
+    results.add({"key": "a", "x": 1}, {"key": "b", "x": 2})
+    assert results.keep([("b",), ("c",)]) == 1
+    assert results.read() == [{"key": "b", "x": 2}]

@@ -5,7 +5,7 @@ A results file is a JSON document: what its rows have in common (seed, configura
 individual episodes or scenes that a row summarizes.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from itertools import islice
@@ -107,6 +107,21 @@ class ResultsFile:
         merged = self._by_key() | {self._key(row): row for row in rows}
         self.path.parent.mkdir(parents=True, exist_ok=True)
         write_json(self.path, {**self.header, "rows": list(merged.values())})
+
+    def keep(self, identifiers: Collection[tuple[Any, ...]]) -> int:
+        """Remove all rows but some from the file.
+
+        Args:
+            identifiers: Values of the fields `keys` of the rows that are kept.
+
+        Returns:
+            Number of removed rows.
+        """
+        rows = self.read()
+        kept = [row for row in rows if self._key(row) in identifiers]
+        if len(kept) < len(rows):
+            write_json(self.path, {**self.header, "rows": kept})
+        return len(rows) - len(kept)
 
     def _by_key(self) -> dict[tuple[Any, ...], Row]:
         return {self._key(row): row for row in self.read()}
