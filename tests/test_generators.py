@@ -2,6 +2,7 @@
 
 from collections import Counter
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -206,3 +207,22 @@ def test_summary_of_a_batch_without_stable_scenes() -> None:
         None,
     )
     assert (summary["solvable_share"], summary["solvable_ci95"]) == (None, None)
+
+
+def test_graphs_that_do_not_fit_are_refused_by_means_of_random_ones(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A graph of the hill climber takes a hundred times as long as a random one."""
+    derived = list[Derivation]()
+    derive = HillClimber.derive
+
+    def counted(*arguments: Any) -> Derivation:
+        derived.append(derive(*arguments))
+        return derived[-1]
+
+    monkeypatch.setattr(HillClimber, "derive", counted)
+    world = world_with("cell.support.size=[0.2,0.2]")
+    generator = SceneGenerator(GenerationJob("hill-climbing", "ycb7", None, 16, 5, world))
+    with pytest.raises(InputError, match=r"nodes: 16; 300 graphs in a row could not be laid out"):
+        generator.lay_out(rng())
+    assert len(derived) == 1

@@ -232,6 +232,8 @@ class SceneGenerator:
         self._grammar = SceneGrammar(load_catalog(job.catalog_folder).object_set(job.objects))
         self._budget = NodeBudget(job.nodes)
         self._agent: GenerationAgent = make_generation_agent(job.agent, job.config, job.temperature)
+        self._random_agent = RandomGenerator()
+        self._has_room = False
         self._judge = DrakeJudge(job.config)
         self._search = OracleSearch(job.config)
 
@@ -260,15 +262,25 @@ class SceneGenerator:
         Raises:
             InputError: `MAX_LAYOUT_ATTEMPTS` graphs in a row could not be laid out.
         """
+        return self._lay_out(self._agent, rng)
+
+    def _lay_out(
+        self, agent: GenerationAgent, rng: np.random.Generator
+    ) -> tuple[Scene, Counter[str]]:
+        """Derive graphs of an agent until one can be laid out, see `lay_out`."""
         failures: Counter[str] = Counter()
         for _ in range(MAX_LAYOUT_ATTEMPTS):
-            derivation = self._agent.derive(self._grammar, self._budget, rng)
+            derivation = agent.derive(self._grammar, self._budget, rng)
             scene = lay_out(
                 derivation, self._grammar.classes, self._job.config, rng, self._job.seed
             )
             if not isinstance(scene, LayoutFailure):
                 return scene, failures
             failures[scene.reason.value] += 1
+            if agent is not self._random_agent and not self._has_room:
+                # A graph of another agent takes up to seconds, a random one milliseconds.
+                self._lay_out(self._random_agent, item_rng(self._job.seed))
+                self._has_room = True
         reasons = ", ".join(f"{count} times {reason}" for reason, count in failures.items())
         raise InputError(
             f"nodes: {self._job.nodes}; {MAX_LAYOUT_ATTEMPTS} graphs in a row could not be laid "
