@@ -123,7 +123,10 @@ class CollisionModel:
         self.arm_names = frozenset(body.name() for body in self._arm.bodies)
         self.fixture_tops = self._highest_points({fixture.name for fixture in cell.fixtures})
         self._attached: _Attached | None = None
-        self._poses = dict[str, RigidTransform]()
+        self._poses = dict[str, Pose]()
+        self._stale = set[str]()
+        """Objects whose poses in the context are outdated: only rare queries need the context."""
+        self._gripper_joints: tuple[float, ...] | None = None
         self._pairs_by_attached = dict[str, NDArray[np.int64]]()
         self._collect_shapes()
 
@@ -135,6 +138,9 @@ class CollisionModel:
         inspector = query.inspector()
         self._geometry_ids = [*self._names]
         self._shape_names = [*self._names.values()]
+        self._owners = {name: k for k, name in enumerate(dict.fromkeys(self._shape_names))}
+        self._shape_owners = np.array([self._owners[name] for name in self._shape_names])
+        self._is_of_arm = np.array([name in self.arm_names for name in self._shape_names])
         self._shapes = ShapeTable(
             inspector,
             {geometry: self._geometry_depths.get(geometry, 0) for geometry in self._names},
@@ -239,16 +245,26 @@ class CollisionModel:
         """Detach the attached object and set the poses of objects."""
         self.detach_object()
         for o in objects:
-            self._place(o.name, rigid_transform(o.X_TO))
-        self._q = self.plant.GetPositions(self._context)
+            self.set_object_pose(o.name, o.X_TO)
 
     def set_object_pose(self, name: str, X_TO: Pose) -> None:
         """Set the pose of one object."""
-        self._place(name, rigid_transform(X_TO))
-        self._q = self.plant.GetPositions(self._context)
+        if self._poses.get(name) != X_TO:
+            self._poses[name] = X_TO
+            self._place(name)
+
+    def _place(self, name: str) -> None:
+        """Place the shapes of an object at its pose."""
+        self._stale.add(name)
+        X_TO = rigid_transform(self._poses[name]).GetAsMatrix4()
+        for shape, X_OS in self._object_shapes[name]:
+            self._shapes.place(shape, X_TO @ X_OS)
 
     def set_gripper_joints(self, positions: Sequence[float]) -> None:
         """Set the positions of the gripper's actuated joints [m]."""
+        if self._gripper_joints == tuple(positions):
+            return
+        self._gripper_joints = tuple(positions)
         self.plant.SetPositions(self._context, self._arm.gripper, np.array(positions))
         self._q = self.plant.GetPositions(self._context)
         X_FT = self._arm.flange.CalcPoseInWorld(self._context).inverse()
@@ -256,13 +272,6 @@ class CollisionModel:
         for shape in self._gripper_shapes:
             X_FS = X_FT @ query.GetPoseInWorld(self._geometry_ids[shape])
             self._shapes.attach(shape, X_FS.GetAsMatrix4())
-
-    def _place(self, name: str, X_TO: RigidTransform) -> None:
-        self.plant.SetFreeBodyPose(self._context, self._bodies[name], X_TO)
-        self._poses[name] = X_TO
-        X = X_TO.GetAsMatrix4()
-        for shape, X_OS in self._object_shapes[name]:
-            self._shapes.place(shape, X @ X_OS)
 
     def attach_object(self, name: str, tool: str, X_OG: RigidTransform) -> None:
         """Attach an object to a tool of the gripper.
@@ -287,7 +296,7 @@ class CollisionModel:
         if self._attached is not None:
             name = self._attached.name
             self._attached = None
-            self._place(name, self._poses[name])
+            self._place(name)
 
     def _attached_pairs(self, name: str) -> NDArray[np.int64]:
         """Return the pairs of shapes whose distances are computed if an object is attached.
@@ -308,35 +317,34 @@ class CollisionModel:
         return self._pairs_by_attached[name]
 
     def distances_along(
-        self, path: Floats, max_distance: float
-    ) -> list[tuple[int, SignedDistance]]:
+        self, path: Floats, max_distance: float, *, with_gradients: bool = False
+    ) -> FoundDistances:
         """Return the signed distances below a threshold along a path.
 
         Args:
             path: Joint positions of the arm. Shape (m, n).
             max_distance: Threshold [m].
-
-        Returns:
-            Pairs of the row of the path and a distance, in the order of the path.
+            with_gradients: Whether to compute gradients.
         """
-        found = self._find_distances(path, max_distance, self._active_pairs, with_gradients=False)
-        return list(zip(found.rows.tolist(), self._to_signed_distances(found), strict=True))
+        return self._find_distances(
+            path, max_distance, self._active_pairs, with_gradients=with_gradients
+        )
 
-    def distances_and_gradients_along(
-        self, path: Floats, max_distance: float
-    ) -> tuple[NDArray[np.int64], list[SignedDistance], Floats]:
-        """Return the signed distances below a threshold along a path with their gradients.
+    def is_between(self, found: FoundDistances, pair: tuple[str, str]) -> NDArray[np.bool_]:
+        """Return whether each distance is one between the owners with two names. Shape (k,)."""
+        first, second = (self._owners.get(name, -1) for name in pair)
+        owners = self._shape_owners[found.pairs]
+        return np.asarray((owners[:, 0] == first) & (owners[:, 1] == second))
 
-        Args:
-            path: Joint positions of the arm. Shape (m, n).
-            max_distance: Threshold [m].
+    def is_to_arm(self, found: FoundDistances) -> NDArray[np.bool_]:
+        """Return whether each distance is one to a part of the arm. Shape (k,)."""
+        return np.asarray(self._is_of_arm[found.pairs[:, 1]])
 
-        Returns:
-            Rows of the path, shape (k,), k distances, and their derivatives by the joint positions
-            [m/rad], shape (k, n).
-        """
-        found = self._find_distances(path, max_distance, self._active_pairs, with_gradients=True)
-        return found.rows, self._to_signed_distances(found), found.gradients
+    def signed_distance(self, found: FoundDistances, index: int) -> SignedDistance:
+        """Return the distance of an index."""
+        first, second = found.pairs[index].tolist()
+        pair = self._shape_names[first], self._shape_names[second]
+        return SignedDistance(float(found.distances[index]), pair)
 
     def distances_below(self, q: Floats, max_distance: float) -> list[SignedDistance]:
         """Return the signed distances below a threshold.
@@ -345,7 +353,8 @@ class CollisionModel:
             q: Joint positions of the arm. Shape (n,).
             max_distance: Threshold [m].
         """
-        return [distance for _, distance in self.distances_along(q[None], max_distance)]
+        found = self.distances_along(q[None], max_distance)
+        return [self.signed_distance(found, k) for k in range(len(found.rows))]
 
     def distances_and_gradients(
         self, q: Floats, max_distance: float
@@ -360,8 +369,10 @@ class CollisionModel:
             Pairs of a signed distance and its derivatives by the joint positions [m/rad], shape
             (n,), in the order of `distances_below`.
         """
-        _, distances, gradients = self.distances_and_gradients_along(q[None], max_distance)
-        return list(zip(distances, gradients, strict=True))
+        found = self.distances_along(q[None], max_distance, with_gradients=True)
+        return [
+            (self.signed_distance(found, k), gradient) for k, gradient in enumerate(found.gradients)
+        ]
 
     def object_distances(self, name: str, max_distance: float) -> list[SignedDistance]:
         """Return the signed distances of an object to solids below a threshold.
@@ -377,15 +388,7 @@ class CollisionModel:
         pairs = np.array([(shape, other) for shape in shapes for other in others], np.int64)
         q = np.zeros((1, len(self._q_indices)))
         found = self._find_distances(q, max_distance, pairs, with_gradients=False)
-        return self._to_signed_distances(found)
-
-    def _to_signed_distances(self, found: FoundDistances) -> list[SignedDistance]:
-        names = self._shape_names
-        pairs = found.pairs.tolist()
-        return [
-            SignedDistance(distance, (names[first], names[second]))
-            for distance, (first, second) in zip(found.distances.tolist(), pairs, strict=True)
-        ]
+        return [self.signed_distance(found, k) for k in range(len(found.rows))]
 
     @property
     def _active_pairs(self) -> NDArray[np.int64]:
@@ -415,6 +418,11 @@ class CollisionModel:
             The result, or None for shapes that just touch: FCL, Drake's library of distances, fails
             on some of them.
         """
+        for name in self._stale & {self._shape_names[shape] for shape in shapes}:
+            X_TO = rigid_transform(self._poses[name])
+            self.plant.SetFreeBodyPose(self._context, self._bodies[name], X_TO)
+            self._q = self.plant.GetPositions(self._context)
+            self._stale.remove(name)
         self._q[self._q_indices] = q
         self.plant.SetPositions(self._context, self._q)
         if self._attached is not None:

@@ -144,7 +144,8 @@ def check_place(
     if tilt > MAX_PLACE_TILT:
         return PlanningFailure(PlanningFailureReason.PLACE_TILTED, placed.name, tilt)
     fixed = [_fixed_solid(corners.tobytes()) for corners in model.fixed_corners]
-    solids = [*fixed, *(solid for o in others for solid in _solids_of(o))]
+    near = [o for o in others if _may_carry(*o.bounds_T, placed)]
+    solids = [*fixed, *(solid for o in near for solid in _solids_of(o))]
     center_of_mass = placed.X_TO.apply(placed.object_class.center_of_mass[None])[0, :2]
     # A slightly tilted object turns onto its face.
     lower, upper = placed.bounds_T
@@ -163,6 +164,12 @@ def check_place(
     return failure
 
 
+def _may_carry(lower: Floats, upper: Floats, placed: SceneObject) -> bool:
+    """Return whether a bounding box reaches below that of a placed object. Shapes (3,)."""
+    lower_placed, upper_placed = placed.bounds_T
+    return bool((lower < upper_placed).all() and (upper[:2] > lower_placed[:2]).all())
+
+
 def _gaps_below(
     placed: SceneObject, solids: Sequence[ConvexSolid], num_samples: int
 ) -> tuple[Floats, Floats]:
@@ -178,11 +185,7 @@ def _gaps_below(
         (m,).
     """
     lower, upper = placed.bounds_T
-    near = [
-        solid
-        for solid in solids
-        if (solid.lower < upper).all() and (solid.upper[:2] > lower[:2]).all()
-    ]
+    near = [solid for solid in solids if _may_carry(solid.lower, solid.upper, placed)]
     # Edges of what is below bound the contact: the axes have samples there.
     axes = []
     for k in range(2):

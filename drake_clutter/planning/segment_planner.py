@@ -27,6 +27,7 @@ from drake_clutter.planning.pick_place_plan import (
     TrajectorySegment,
 )
 from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.planning.shape_table import FoundDistances
 from drake_clutter.planning.time_parameterization import (
     MAX_JOINT_STEP,
     bspline_path,
@@ -169,58 +170,45 @@ class SegmentPlanner:
             The distance, infinite if nothing is near, or None after recording a failure if a
             distance is too small.
         """
-        closest = SignedDistance(math.inf)
-        min_distance = self._config.min_distance
-        offsets = self._endpoint_offsets(path, endpoint)
-        for row, distance in self._collision_model.distances_along(path, MAX_REPORTED_DISTANCE):
-            required = self._required_distance(distance, endpoint, offsets[row], min_distance)
-            if distance.distance < required:
-                self._failures.record(
-                    progress,
-                    PlanningFailureReason.IN_COLLISION,
-                    f"{stage}: {' and '.join(distance.pair)}",
-                    distance.distance,
-                )
-                return None
-            if (
-                required == min_distance
-                and distance.distance < closest.distance
-                and distance.pair[1] not in self._collision_model.arm_names
-            ):
-                closest = distance
-        return closest
+        model, min_distance = self._collision_model, self._config.min_distance
+        found = model.distances_along(path, MAX_REPORTED_DISTANCE)
+        required = self._required_distances(found, path, endpoint, min_distance)
+        if too_close := np.flatnonzero(found.distances < required).tolist():
+            nearest = model.signed_distance(found, too_close[0])
+            self._failures.record(
+                progress,
+                PlanningFailureReason.IN_COLLISION,
+                f"{stage}: {' and '.join(nearest.pair)}",
+                nearest.distance,
+            )
+            return None
+        counts = (required == min_distance) & ~model.is_to_arm(found)
+        if not counts.any():
+            return SignedDistance(math.inf)
+        return model.signed_distance(found, int(np.where(counts, found.distances, np.inf).argmin()))
 
-    def _endpoint_offsets(self, path: Floats, endpoint: EndpointContext) -> list[float]:
-        """Return the horizontal distances of the tool from an endpoint along a path [m]."""
-        p_TG = self._collision_model.tool_positions(endpoint.tool, path)
-        offsets: list[float] = np.linalg.norm(p_TG[:, :2] - endpoint.p_TG_xy, axis=1).tolist()
-        return offsets
-
-    def _required_distance(
-        self,
-        distance: SignedDistance,
-        endpoint: EndpointContext,
-        offset: float,
-        min_distance: float,
-    ) -> float:
-        """Return the required distance of a pair [m].
+    def _required_distances(
+        self, found: FoundDistances, path: Floats, endpoint: EndpointContext, min_distance: float
+    ) -> Floats:
+        """Return the required distances of pairs along a path [m]. Shape (k,).
 
         The gripper may touch the picked object, and the attached object may touch its neighbors at
         the endpoint. The required distance grows with the horizontal distance from the endpoint.
 
         Args:
-            distance: Distance of the pair.
+            found: Distances along the path. Length k.
+            path: Configurations. Shape (m, n).
             endpoint: Endpoint near which smaller distances are allowed.
-            offset: Horizontal distance of the tool from the endpoint [m].
             min_distance: Required distance of all other pairs [m].
         """
-        if distance.pair in self._grasp_contacts[endpoint.tool]:
-            allowed = self._config.lip_gap / 2
-        elif distance.pair in endpoint.allowed_distances:
-            allowed = endpoint.allowed_distances[distance.pair]
-        else:
-            return min_distance
-        return min(min_distance, allowed + offset)
+        p_TG = self._collision_model.tool_positions(endpoint.tool, path)
+        offsets = np.hypot(*(p_TG[:, :2] - endpoint.p_TG_xy).T)
+        contacts = dict.fromkeys(self._grasp_contacts[endpoint.tool], self._config.lip_gap / 2)
+        required = np.full(len(found.rows), min_distance)
+        for pair, allowed in {**endpoint.allowed_distances, **contacts}.items():
+            of_pair = self._collision_model.is_between(found, pair)
+            required[of_pair] = np.minimum(min_distance, allowed + offsets[found.rows[of_pair]])
+        return required
 
     def distances_below_object(
         self, candidate: GraspCandidate, q: Floats, below: Set[str]
@@ -411,24 +399,17 @@ class SegmentPlanner:
         arm_context = self._arm_context(segment.name, endpoints)
 
         def nearby_distances(q: Floats, s: Floats) -> LinearizedDistances:
-            contexts = [endpoints[int(at >= 0.5)] if is_carry else arm_context for at in s]
-            offsets = [
-                self._endpoint_offsets(q, context)
+            found = self._collision_model.distances_along(
+                q, INFLUENCE_DISTANCE, with_gradients=True
+            )
+            required = [
+                self._required_distances(found, q, context, min_distance)
                 for context in (endpoints if is_carry else (arm_context, arm_context))
             ]
-            rows, distances, gradients = self._collision_model.distances_and_gradients_along(
-                q, INFLUENCE_DISTANCE
-            )
-            slack = [
-                distance.distance
-                - self._required_distance(
-                    distance, contexts[row], offsets[int(s[row] >= 0.5)][row], min_distance
-                )
-                for row, distance in zip(rows, distances, strict=True)
-            ]
+            slack = found.distances - np.where(s[found.rows] < 0.5, *required)
             # Distances between neighboring wrist links are constant.
-            varies = np.abs(gradients).max(axis=1, initial=0.0) > 1e-6
-            return LinearizedDistances(rows[varies], gradients[varies], np.array(slack)[varies])
+            varies = np.abs(found.gradients).max(axis=1, initial=0.0) > 1e-6
+            return LinearizedDistances(found.rows[varies], found.gradients[varies], slack[varies])
 
         limits = MotionLimits(self._cell, payload)
         problem = TrajectoryOptimizationProblem(
