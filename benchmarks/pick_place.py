@@ -47,7 +47,11 @@ from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.drake_judge import DrakeJudge
 from drake_clutter.station.arm_executor import ArmExecutor, worst_instability
 from drake_clutter.station.grasp_constraint import WeldPair
-from drake_clutter.station.station_simulation import PickPlaceResult, StationSimulation
+from drake_clutter.station.station_simulation import (
+    PickPlaceResult,
+    StationSimulation,
+    simulate_plan,
+)
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.tasks.belief import legal_moves
 from drake_clutter.validation import to_plain
@@ -256,7 +260,7 @@ class MoveTester:
             is_possible = planner.are_endpoints_reachable(*arguments)
             return Trial(str(plan.reason.value), is_possible, name, unoptimized.planning_time)
         start = time.perf_counter()
-        execution = StationSimulation(default_cell(), scene).execute(plan)
+        execution = simulate_plan(default_cell(), scene, plan)
         wall = time.perf_counter() - start
         result = execution_result(execution)
         return Trial(
@@ -414,10 +418,10 @@ def timing(
             "timing of a path without load",
             lambda: parameterize_time_optimal(bspline_path(q), unloaded),
         )
-        simulation = stopwatch.measure(
-            "simulation, built", lambda: StationSimulation(default_cell(), scene)
+        stopwatch.measure(
+            "simulation, built", lambda: StationSimulation(default_cell(), scene).release()
         )
-        stopwatch.measure("simulation, run", lambda: simulation.execute(plan))
+        stopwatch.measure("simulation, run", lambda: simulate_plan(default_cell(), scene, plan))
         return True
 
     measured = filter(measure_move, itertools.count())

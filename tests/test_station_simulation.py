@@ -1,12 +1,14 @@
 """Station simulation: reset, steps, recordings and fixtures."""
 
+import gc
+import weakref
 from functools import partial
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from conftest import cell_with, resting, scene_of
+from conftest import DEFAULT_CELL, cell_with, resting, scene_of
 from pydrake.systems.analysis import Simulator
 
 from drake_clutter.catalog import load_catalog
@@ -25,7 +27,12 @@ from drake_clutter.scenes.scene import Pose
 from drake_clutter.simulation.scene_plant import pose_from_transform
 from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.messages import PlannedMove
-from drake_clutter.station.station_simulation import STEP_PERIOD, TIME_STEP, StationSimulation
+from drake_clutter.station.station_simulation import (
+    STEP_PERIOD,
+    TIME_STEP,
+    StationSimulation,
+    simulate_plan,
+)
 from drake_clutter.station.trajectory_file import read_trajectories, write_trajectories
 from drake_clutter.validation import config_yaml
 
@@ -221,3 +228,46 @@ def test_a_fixture_that_moves_is_refused(tmp_path: Path) -> None:
         StationSimulation(with_board(path, 0.3), SCENE)
     with pytest.raises(InputError, match=r"fixtures\.shelf\.model: .*expected an SDF or URDF"):
         StationSimulation(with_board(tmp_path / "none.urdf", 0.3), SCENE)
+
+
+def test_a_move_simulated_with_few_movable_objects_ends_at_the_same_poses() -> None:
+    """The coarse simulation stands for an uneventful move."""
+    plan, full = planned(), StationSimulation(CELL, SCENE)
+    exact = full.execute(plan)
+    result = simulate_plan(CELL, SCENE, plan, record=True)
+    assert result.is_uneventful
+    assert result.simulated_time == pytest.approx(exact.simulated_time, abs=1e-9)
+    for name, X_TO in exact.poses.items():
+        assert result.poses[name].p == pytest.approx(X_TO.p, abs=2e-4)
+        assert result.motion[-1].poses[name] == result.poses[name]
+    assert result.max_load_ratio == pytest.approx(exact.max_load_ratio, abs=0.2)
+
+
+def test_a_move_that_hits_another_object_is_simulated_with_all_objects_movable() -> None:
+    """The plan does not know of the box at the place, which cannot move at first."""
+    scene = scene_of(SCENE["pudding_box"], resting("cracker_box", xy=(0.0, -0.2)))
+    few = StationSimulation(CELL, scene, movable={"pudding_box"})
+    assert few.execute(planned()).displacements["cracker_box"] == 0.0
+    assert few.woken_fixed_objects == {"cracker_box"}
+    result = simulate_plan(CELL, scene, planned())
+    assert result.displacements["cracker_box"] > 0.001
+
+
+def test_a_lost_object_is_simulated_with_all_objects_movable() -> None:
+    cell = cell_with("gripper.vacuum=0.02")
+    plan = planned(DEFAULT_CELL)
+    result = simulate_plan(cell, SCENE, plan)
+    assert result.lost_object
+    assert result.poses == StationSimulation(cell, SCENE).execute(plan).poses
+
+
+def test_a_released_simulation_leaves_no_memory_behind() -> None:
+    simulation = StationSimulation(CELL, SCENE)
+    simulation.step()
+    station = weakref.ref(simulation.station)
+    assert station() is not None
+    simulation.release()
+    del simulation
+    for _ in range(3):  # what a generation holds is found one after the other
+        gc.collect()
+    assert station() is None

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.geometry import (
     AddContactMaterial,
     AddRigidHydroelasticProperties,
@@ -84,6 +85,10 @@ class ScenePlant:
             for n in (self.bodies if names is None else names)
         }
 
+    def positions(self, context: Context, names: Iterable[str]) -> dict[str, NDArray[np.float64]]:
+        """Return the positions of the origins of the named objects [m]. Shapes (3,)."""
+        return {n: self.bodies[n].EvalPoseInWorld(context).translation() for n in names}
+
     def speeds(self, context: Context, names: Iterable[str]) -> dict[str, float]:
         """Return the speeds of the origins of the named objects [m/s]."""
         return {
@@ -160,6 +165,26 @@ def add_scene_plant(
     return add_objects(
         plant, scene_graph, objects, support, visuals=visuals, object_with_joint=object_with_joint
     )
+
+
+def add_fixed_objects(
+    plant: MultibodyPlant, objects: Iterable[SceneObject]
+) -> dict[str, RigidBody]:
+    """Add objects that are fixed at their poses to a plant, and return their bodies by name.
+
+    They collide with other bodies, but have no state.
+
+    Args:
+        plant: The plant.
+        objects: Objects at their poses.
+    """
+    bodies = {}
+    for o in objects:
+        text = read_sdf_text(o.object_class.verified_sdf_path, visuals=False)
+        (instance,) = Parser(plant, model_name_prefix=o.name).AddModelsFromString(text, "sdf")
+        bodies[o.name] = plant.GetBodyByName("body", instance)
+        plant.WeldFrames(plant.world_frame(), bodies[o.name].body_frame(), rigid_transform(o.X_TO))
+    return bodies
 
 
 def add_objects(

@@ -21,7 +21,7 @@ from drake_clutter.scenes.interfaces import (
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.simulation.drake_judge import TOUCHING_MARGIN
 from drake_clutter.simulation.settle import find_instability, settle
-from drake_clutter.station.station_simulation import StationSimulation
+from drake_clutter.station.station_simulation import simulate_plan
 
 MIN_DISPLACEMENT = 1e-4
 """Smallest displacement during the motion after which an object is settled again [m].
@@ -71,7 +71,7 @@ class ArmExecutor:
         plan = self.plan(scene, command)
         if isinstance(plan, PlanningFailure):
             return Outcome(MoveResult.NOT_PLANNED, scene, detail=str(plan))
-        result = StationSimulation(self._config.cell, scene).execute(plan, record=True)
+        result = simulate_plan(self._config.cell, scene, plan, record=True)
         # The arm lowers the object beyond its planned pose until contact.
         X_TO_place = plan.X_TO_place.translated((0.0, 0.0, -result.lowered_distance))
         after = scene.with_poses(result.poses)

@@ -104,6 +104,8 @@ class BodySleepManager:
 
     Attributes:
         awake: Names of the objects that may move.
+        woken_fixed_objects: Names of the fixed objects of the station that had to be woken since
+            the last reset. In reality they might have moved.
     """
 
     MAX_SLEEP_SPEED = 0.002
@@ -128,6 +130,7 @@ class BodySleepManager:
             root: Context of the root diagram.
         """
         self.awake = set[str]()
+        self.woken_fixed_objects = set[str]()
         self._position_history = deque[tuple[float, dict[str, Floats]]](maxlen=self.WINDOW)
         self._contact_history = deque[set[str]](maxlen=self.WINDOW)
         self._locked_filter = None
@@ -156,6 +159,9 @@ class BodySleepManager:
         awake = {*required, *moving, *({grasp.held} - {""})}.union(*self._contact_history)
         if lost_object:
             awake = set(self._station.object_classes)
+        fixed = awake & self._station.fixed_bodies.keys()
+        self.woken_fixed_objects |= fixed
+        awake -= fixed
         if awake != self.awake:
             self._lock_all_but(root, awake)
             self.awake = awake
@@ -168,8 +174,7 @@ class BodySleepManager:
         scene_plant = self._station.scene_plant
         context = self._station.plant_context(root)
         speeds = scene_plant.speeds(context, self.awake)
-        poses = scene_plant.poses(context, self.awake)
-        positions = {name: X_TO.p for name, X_TO in poses.items()}
+        positions = scene_plant.positions(context, self.awake)
         if len(self._position_history) == self.WINDOW:
             earlier_time, earlier_positions = self._position_history[0]
             duration = root.get_time() - earlier_time
@@ -195,7 +200,11 @@ class BodySleepManager:
         context = station.plant_context(root)
         locked = GeometrySet()
         fixed = GeometrySet()
-        for body in (*station.arm.fixed, get_support_body(plant)):
+        for body in (
+            *station.arm.fixed,
+            *station.fixed_bodies.values(),
+            get_support_body(plant),
+        ):
             fixed.Add(plant.GetCollisionGeometriesForBody(body))
         for name, joint in station.free_joints.items():
             if name in awake:

@@ -20,6 +20,7 @@ from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.simulation.cell_plant import Arm, add_work_cell, joint_state_indices
 from drake_clutter.simulation.scene_plant import (
     ScenePlant,
+    add_fixed_objects,
     add_objects,
     add_scene_plant,
     rigid_transform,
@@ -77,6 +78,7 @@ class ClutterStation(Diagram):
         object_classes: Classes of the objects, by name.
         time_step: Time step of the plant [s].
         scene_plant: Plant with the bodies of the objects.
+        fixed_bodies: Bodies of the fixed objects, by name.
         plant: Plant of arm, cell and objects.
         arm: Frames and bodies of the arm in the plant.
         grasp: Grasp constraint between a suction cup and an object; None for other grippers.
@@ -92,6 +94,7 @@ class ClutterStation(Diagram):
         objects: Sequence[tuple[str, ObjectClass]],
         *,
         time_step: float,
+        fixed_objects: Sequence[SceneObject] = (),
         weld: WeldPair | None = None,
         visuals: bool = False,
     ) -> None:
@@ -99,15 +102,17 @@ class ClutterStation(Diagram):
 
         Args:
             cell: Work cell.
-            objects: Name and class of each object.
+            objects: Name and class of each object that can move.
             time_step: Time step of the plant [s].
+            fixed_objects: Further objects that are fixed at their poses. They have no state, which
+                makes a step cheaper, and are not shown to cameras.
             weld: The only object that can be grasped, with a `WeldGrasp`; None for a
                 `CompliantGrasp` of any object.
             visuals: Whether to add visual geometry for cameras.
         """
         super().__init__()
         self.cell = cell
-        self.object_classes = dict(objects)
+        self.object_classes = dict(objects) | {o.name: o.object_class for o in fixed_objects}
         self.time_step = time_step
         self._weld = weld
         self._weldable_object = weld.object_name if weld else ""
@@ -121,6 +126,7 @@ class ClutterStation(Diagram):
             object_with_joint=self._weldable_object,
         )
         self.plant = plant = self.scene_plant.plant
+        self.fixed_bodies = add_fixed_objects(plant, fixed_objects)
         graph = self.scene_plant.scene_graph
         self.arm = add_work_cell(plant, graph, cell, compliant=True, visuals=False)
         _set_position_gains(plant, self.arm.robot, JOINT_STIFFNESS, JOINT_DAMPING)
@@ -134,7 +140,8 @@ class ClutterStation(Diagram):
             for index in plant.GetJointIndices(body.model_instance())
         }
         self._object_names = {
-            int(body.index()): name for name, body in self.scene_plant.bodies.items()
+            int(body.index()): name
+            for name, body in (self.scene_plant.bodies | self.fixed_bodies).items()
         }
         self._q_indices, self._v_indices = joint_state_indices(plant, self.arm)
         num_joints = len(self.arm.joints)
@@ -186,7 +193,8 @@ class ClutterStation(Diagram):
     @property
     def graspable_objects(self) -> tuple[str, ...]:
         """Names of the objects that can be grasped."""
-        return (self._weldable_object,) if self._weldable_object else tuple(self.object_classes)
+        names = tuple(self.scene_plant.bodies)
+        return (self._weldable_object,) if self._weldable_object else names
 
     def plant_context(self, root: Context) -> Context:
         """Return the context of the plant from the context of the root diagram."""
@@ -198,7 +206,7 @@ class ClutterStation(Diagram):
         Args:
             root: Context of the root diagram.
             q: Joint positions of the arm [rad]. Shape (n,).
-            objects: Objects at their poses.
+            objects: Objects that can move, at their poses.
         """
         context = self.plant_context(root)
         positions = self.plant.GetPositions(context)

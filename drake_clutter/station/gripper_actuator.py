@@ -1,7 +1,7 @@
 """Actuation of a gripper in a running simulation.
 
 Attaching an object changes parameters of the plant, which no Drake system may do to another one.
-The simulation therefore calls the actuator from its monitor after every step.
+The simulation therefore calls the actuator between its steps.
 """
 
 import math
@@ -17,7 +17,7 @@ from drake_clutter.cell.lip_seal import lip_surface_profile
 from drake_clutter.cell.suction import SuctionGripper
 from drake_clutter.station.clutter_station import ClutterStation
 
-GRIPPER_UPDATE_PERIOD = 0.01
+GRIPPER_UPDATE_PERIOD = 0.0125
 """Period at which the command and the load are checked [s]."""
 OVERLOAD_RELEASE_TIME = 0.02
 """Duration of an overload after which the object detaches [s].
@@ -74,7 +74,7 @@ class GripperActuator(Protocol):
         """Attach or release an object.
 
         Args:
-            root: Context of the root diagram, after a step.
+            root: Context of the root diagram; called every `GRIPPER_UPDATE_PERIOD`.
         """
 
 
@@ -113,15 +113,11 @@ class SuctionActuator:
         self.status = GraspStatus()
         self._last_tool = ""
         self._num_overloads = 0  # consecutive updates with overload
-        self._last_update = -math.inf
         self._X_OG = RigidTransform()  # at the last attachment
 
     def update(self, root: Context) -> None:
         """Attach or release an object, see `GripperActuator`."""
         time = root.get_time()
-        if 0 <= time - self._last_update < GRIPPER_UPDATE_PERIOD - self._station.time_step / 2:
-            return
-        self._last_update = time
         context = self._station.plant_context(root)
         tool = self._commanded_tool(root)
         if self.status.held and tool != self.status.tool:

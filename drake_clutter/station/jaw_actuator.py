@@ -1,6 +1,5 @@
 """Status of parallel jaws in a running simulation; friction holds the object between them."""
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -49,15 +48,11 @@ class JawActuator:
         self.status = GraspStatus()
         self._was_commanded = False
         self._num_missing = 0  # consecutive updates without contact
-        self._last_update = -math.inf
         self._X_OG = RigidTransform()  # at the first contact
 
     def update(self, root: Context) -> None:
         """Observe the contacts of the jaws, see `GripperActuator`."""
         time = root.get_time()
-        if 0 <= time - self._last_update < GRIPPER_UPDATE_PERIOD - self._station.time_step / 2:
-            return
-        self._last_update = time
         context = self._station.plant_context(root)
         tool = self._commanded_tool(root)
         if tool and not self._was_commanded:

@@ -1,16 +1,20 @@
 """Simulation of the station: advances its Diagram and executes plans.
 
+result = simulate_plan(cell, scene, plan)
+
+or, for several plans one after the other:
+
 simulation = StationSimulation(cell, scene)
 result = simulation.execute(plan)
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
@@ -19,7 +23,11 @@ from drake_clutter.scenes.scene import Pose, Scene, tilt_between
 from drake_clutter.station.body_sleep import BodySleepManager, affected_bodies, bodies_to_wake
 from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.grasp_constraint import WeldPair
-from drake_clutter.station.gripper_actuator import GripperActuator, SuctionActuator
+from drake_clutter.station.gripper_actuator import (
+    GRIPPER_UPDATE_PERIOD,
+    GripperActuator,
+    SuctionActuator,
+)
 from drake_clutter.station.jaw_actuator import JawActuator
 from drake_clutter.station.messages import PlannedMove
 from drake_clutter.station.pick_place_executor import ExecutorState, PickPlaceExecutor
@@ -30,6 +38,17 @@ STEP_PERIOD = 0.025
 """Period of a step: of updates of `BodySleepManager`, and of recorded samples [s]."""
 TIME_STEP = STEP_PERIOD / 10
 """Time step of the plant [s]. With twice as much, high stacks creep and fall."""
+COARSE_TIME_STEP = 2 * TIME_STEP
+"""Time step of moves in which nothing unexpected happens [s], see `simulate_plan`."""
+MAX_COARSE_DISPLACEMENT = 0.001
+"""Largest error of the final position, and largest displacement of another object, of a move that
+counts as uneventful [m]."""
+MAX_COARSE_TILT = math.radians(1)
+"""Largest error of the final orientation of such a move [rad]."""
+_TIME_MARGIN = 0.001
+"""Time by which the simulator advances beyond a step [s], so that rounding does not decide which
+update of the plant belongs to it; less than a time step."""
+_GRIPPER_UPDATES_PER_STEP = round(STEP_PERIOD / GRIPPER_UPDATE_PERIOD)
 POST_MOTION_WAIT = 1.0
 """Time after the end of a plan in which fallen objects stay awake [s]."""
 
@@ -80,6 +99,16 @@ class PickPlaceResult:
         """Whether the object was not held until its release."""
         return not self.grasped or not math.isnan(self.drop_time)
 
+    @property
+    def is_uneventful(self) -> bool:
+        """Whether the object was held and rests at its place pose, and no other one has moved."""
+        return (
+            not self.lost_object
+            and self.position_error <= MAX_COARSE_DISPLACEMENT
+            and self.orientation_error <= MAX_COARSE_TILT
+            and max(self.displacements.values(), default=0.0) <= MAX_COARSE_DISPLACEMENT
+        )
+
     def __str__(self) -> str:
         if not self.grasped:
             return "the gripper did not grasp the object"
@@ -109,6 +138,8 @@ class StationSimulation:
         cell: WorkCell,
         scene: Scene,
         *,
+        movable: Set[str] | None = None,
+        time_step: float = TIME_STEP,
         weld: WeldPair | None = None,
         visuals: bool = False,
         add_systems: AddSystems | None = None,
@@ -118,6 +149,9 @@ class StationSimulation:
         Args:
             cell: Work cell; its support is replaced by that of the scene.
             scene: Objects at rest.
+            movable: Names of the objects that can move; None for all. The others are fixed at their
+                poses, which makes a step cheaper, see `woken_fixed_objects`.
+            time_step: Time step of the plant [s].
             weld: The only object that can be grasped; None for any, see `ClutterStation`.
             visuals: Whether to add visual geometry for cameras.
             add_systems: Adds further systems, such as a planner; None if plans are passed to
@@ -128,13 +162,15 @@ class StationSimulation:
         """
         self.cell = cell.with_support(scene.support)
         builder = DiagramBuilder()
-        named_classes = [(o.name, o.object_class) for o in scene.objects]
+        names = set(scene.names) if movable is None else movable
+        named_classes = [(o.name, o.object_class) for o in scene.objects if o.name in names]
         self.station: ClutterStation = builder.AddNamedSystem(
             "clutter_station",
             ClutterStation(
                 self.cell,
                 named_classes,
-                time_step=TIME_STEP,
+                time_step=time_step,
+                fixed_objects=[o for o in scene.objects if o.name not in names],
                 weld=weld,
                 visuals=visuals,
             ),
@@ -160,19 +196,29 @@ class StationSimulation:
         """Reset to time 0, with the arm at home and the objects at rest.
 
         Args:
-            scene: Objects with the names that the simulation was built with.
+            scene: Objects with the names that the simulation was built with. The poses of fixed
+                ones are those that it was built with.
         """
         self._scene = scene
         # The first step initializes the simulator: a plan that is available then starts at time 0.
         self.simulator = Simulator(self.diagram)
-        self.station.set_state(self.root, np.array(self.cell.robot.home), scene.objects)
+        movable = [o for o in scene.objects if o.name in self.station.scene_plant.bodies]
+        self.station.set_state(self.root, np.array(self.cell.robot.home), movable)
         self.gripper.reset()
         self._sleep.reset(self.root)
         self._num_steps = 0
         self._affected_plan = 0
         self._affected_at_pick = set[str]()
         self._affected_at_place = set[str]()
-        self.simulator.set_monitor(self._monitor)
+
+    def release(self) -> None:
+        """Free the memory of the diagram; the simulation cannot be used afterwards.
+
+        Systems written in Python and the diagram that owns them refer to each other through C++,
+        which the garbage collector does not see.
+        """
+        for system in (self.station, self.executor):
+            system.__dict__.clear()
 
     @property
     def root(self) -> Context:
@@ -188,6 +234,14 @@ class StationSimulation:
     def scene(self) -> Scene:
         """Objects at their current poses."""
         return self._scene.with_poses(self.station.scene_plant.poses(self.plant_context))
+
+    @property
+    def woken_fixed_objects(self) -> frozenset[str]:
+        """Names of fixed objects that were hit, or that a lost object might have hit.
+
+        If there are any, the simulation must be repeated with all objects movable.
+        """
+        return frozenset(self._sleep.woken_fixed_objects)
 
     @property
     def executor_state(self) -> ExecutorState:
@@ -223,8 +277,11 @@ class StationSimulation:
             end = state.schedule.end_time + POST_MOTION_WAIT
             expects_grasp = state.schedule.grasp_time + STEP_PERIOD <= elapsed < end
         self._sleep.update(self.root, required, self.gripper.status, expects_grasp=expects_grasp)
+        start = self._num_steps * STEP_PERIOD + _TIME_MARGIN
+        for k in range(_GRIPPER_UPDATES_PER_STEP):
+            self.simulator.AdvanceTo(start + (k + 1) * GRIPPER_UPDATE_PERIOD)
+            self.gripper.update(self.root)
         self._num_steps += 1
-        self.simulator.AdvanceTo(self._num_steps * STEP_PERIOD + TIME_STEP / 2)
 
     def run_until(self, condition: Callable[[], bool]) -> None:
         """Step until a condition holds; it is checked before each step."""
@@ -236,7 +293,11 @@ class StationSimulation:
         context = self.plant_context
         arm = self.station.arm_state(context, self._commanded_tool(self.root))
         time = self.root.get_time() - self.executor_state.start_time
-        return MotionSample(time, self.station.scene_plant.poses(context), arm)
+        return MotionSample(time, self._poses(), arm)
+
+    def _poses(self) -> dict[str, Pose]:
+        """Return X_TO of all objects, by name."""
+        return {o.name: o.X_TO for o in self.scene.objects}
 
     def execute(self, plan: PickPlacePlan, *, record: bool = False) -> PickPlaceResult:
         """Execute a plan until the arm is home, and for `SETTLE_TIME` more.
@@ -276,7 +337,7 @@ class StationSimulation:
         max_tracking_error: float,
         motion: tuple[MotionSample, ...],
     ) -> PickPlaceResult:
-        poses = self.station.scene_plant.poses(self.plant_context)
+        poses = self._poses()
         status = self.gripper.status
         object_class = self.station.object_classes[plan.pick]
         X_TO = poses[plan.pick]
@@ -318,6 +379,30 @@ class StationSimulation:
             "",
         )
 
-    def _monitor(self, root: Context) -> EventStatus:
-        self.gripper.update(root)
-        return EventStatus.DidNothing()
+
+def simulate_plan(
+    cell: WorkCell, scene: Scene, plan: PickPlacePlan, *, record: bool = False
+) -> PickPlaceResult:
+    """Execute a plan in a simulation of its own.
+
+    At first the time step is `COARSE_TIME_STEP`, and only the objects that the plan may disturb
+    can move. If the move is not uneventful, or one of the other objects is hit, it is simulated
+    again with `TIME_STEP` and all objects movable.
+
+    Args:
+        cell: Work cell; its support is replaced by that of the scene.
+        scene: Objects at rest.
+        plan: Plan to execute.
+        record: Whether to record a sample per step.
+    """
+    affected = set.union(*affected_bodies(scene.objects, plan))
+    coarse = StationSimulation(cell, scene, movable=affected, time_step=COARSE_TIME_STEP)
+    result = coarse.execute(plan, record=record)
+    is_accepted = result.is_uneventful and not coarse.woken_fixed_objects
+    coarse.release()
+    if is_accepted:
+        return result
+    fine = StationSimulation(cell, scene)
+    result = fine.execute(plan, record=record)
+    fine.release()
+    return result
