@@ -49,21 +49,20 @@ def held_box(vacuum: float, duration: float) -> tuple[list[float], list[GraspSta
         if k % steps_per_update == 0:
             force, moment = station.grasp.load(context, TOOL)
             ratios.append(float(cell.gripper.load_ratio(TOOL, force, moment)))
-        actuator.update(root)
-        if k % steps_per_update == 0:
+            actuator.update(root)
             statuses.append(actuator.status)
     return ratios, statuses
 
 
-@pytest.mark.parametrize("vacuum", [0.8, 0.08])
+@pytest.mark.parametrize("vacuum", [0.7, 0.08])
 def test_an_object_comes_off_after_an_overload_of_a_duration(vacuum: float) -> None:
     """The box bounces on the bellows: with the larger vacuum, a shorter overload precedes."""
     ratios, statuses = held_box(vacuum, 0.2)
     assert statuses[0].held == BOX.name
     overloaded = [False, *(ratio > 1 for ratio in ratios[1:])]
-    count = round(OVERLOAD_RELEASE_TIME / GRIPPER_UPDATE_PERIOD) + 1
+    count = int(OVERLOAD_RELEASE_TIME / GRIPPER_UPDATE_PERIOD) + 1
     last = next(k for k in range(len(overloaded)) if all(overloaded[max(k - count + 1, 0) : k + 1]))
-    assert (sum(overloaded[:last]) >= count) == (vacuum == 0.8)
+    assert (sum(overloaded[:last]) >= count) == (vacuum == 0.7)
     assert [status.held == BOX.name for status in statuses] == [
         k < last for k in range(len(statuses))
     ]
