@@ -158,11 +158,6 @@ def main(
             )
         learner.warm_start(load_rule_network(checkpoint, grammar))
     run = TrainingRun(out, training, learner, learning.total_timesteps)
-    losses = list[float]()
-
-    def train_iteration() -> None:
-        learner.train_iteration()
-        losses.extend(learner.losses)
 
     def evaluate() -> tuple[Metrics, Metrics]:
         episodes = sample_episodes(
@@ -172,15 +167,15 @@ def main(
             learning.temperature,
             training.seed,
         )
-        loss = float(np.mean(losses or [0.0]))
-        losses.clear()
+        loss = float(np.mean(learner.losses or [0.0]))
+        learner.losses.clear()
         return scene_metrics(episodes, grammar.classes), {"loss": loss}
 
     train_to_end(
         run,
         learner,
         learning.total_timesteps,
-        train_iteration=train_iteration,
+        train_iteration=learner.train_iteration,
         evaluate=evaluate,
         evaluate_every=training.evaluate_every,
         save_every=training.save_every,

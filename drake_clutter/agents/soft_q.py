@@ -281,7 +281,7 @@ class SoftQLearner:
         device: Device of the networks.
         step: Number of environment steps so far.
         network: The Q-network.
-        losses: Losses of the updates of the latest iteration.
+        losses: Losses of all updates since the list was last cleared.
     """
 
     def __init__(
@@ -391,7 +391,7 @@ class SoftQLearner:
         updates_before = self._num_updates_due()
         self.step += len(self._environments)
         losses = [self._update() for _ in range(self._num_updates_due() - updates_before)]
-        self.losses = [loss for loss in losses if loss is not None]
+        self.losses += [loss for loss in losses if loss is not None]
         return ended
 
     def _num_updates_due(self) -> int:
@@ -462,6 +462,7 @@ class SoftQLearner:
             "step": self.step,
             "num_added": self._buffer.num_added,
             "rng": self._rng.bit_generator.state,
+            "losses": self.losses,
             "environments": [
                 {
                     "rules": environment.partial.rules,
@@ -487,6 +488,7 @@ class SoftQLearner:
         self._buffer.num_added = state["num_added"]
         self.step = state["step"]
         self._rng.bit_generator.state = state["rng"]
+        self.losses = list(state.get("losses", []))  # States of version 0.1 have none.
         for k, environment in enumerate(self._environments):
             env_state = with_current_keys(state["environments"][k], RENAMED_STATE)
             observation, info = environment.reset()
