@@ -1,5 +1,6 @@
 # make demo   SG* makes a scene, the arm searches it; the results are in out/demo
 # make test   every check: lint, format, spelling, types, tests
+# make nightly   the tests that take hours: DAMAGED_FILES damaged files of each kind, KILLS stops of each command
 # make test-any PYTHON=...   the tests with an interpreter and its packages as they are, without what is not installed
 # make docs   the documentation site: out/site/index.html
 # Each makes its own environment in .venv first; the demo's has only what the demo needs.
@@ -7,7 +8,7 @@
 PYTHON ?= python3
 PIP := .venv/bin/python -m pip --disable-pip-version-check --quiet install --no-compile
 
-.PHONY: demo docs test test-any
+.PHONY: demo docs nightly test test-any
 
 demo: .venv/demo
 	rm -rf out/demo
@@ -19,6 +20,11 @@ test: .venv/all
 	.venv/bin/codespell
 	.venv/bin/mypy
 	OMP_NUM_THREADS=1 .venv/bin/pytest --numprocesses 2 --dist loadfile
+
+nightly: export DAMAGED_FILES ?= 2000
+nightly: export KILLS ?= 20
+nightly: .venv/all
+	OMP_NUM_THREADS=1 .venv/bin/pytest --numprocesses 2 tests/test_damaged_files.py tests/test_kills.py
 
 test-any:
 	OMP_NUM_THREADS=1 PYTHONPATH=$(CURDIR) $(PYTHON) -m pytest -q -rs --ignore tests/test_install.py

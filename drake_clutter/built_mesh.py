@@ -42,11 +42,19 @@ def hash_mesh_file(path: Path) -> str:
     content = path.read_bytes()
     digest = hashlib.sha256(content)
     if path.suffix.lower() == ".gltf":
-        for buffer in json.loads(content).get("buffers", []):
-            beside = path.parent / str(buffer.get("uri", ""))
-            if not str(buffer.get("uri", "")).startswith("data:") and beside.is_file():
-                digest.update(beside.read_bytes())
+        for uri in _buffer_uris(content):
+            if not uri.startswith("data:") and (path.parent / uri).is_file():
+                digest.update((path.parent / uri).read_bytes())
     return digest.hexdigest()
+
+
+def _buffer_uris(gltf: bytes) -> list[str]:
+    """Return the addresses of the buffers of a glTF file; an empty list if it is damaged."""
+    try:
+        buffers = json.loads(gltf.decode(errors="replace"))["buffers"]
+        return [str(buffer["uri"]) for buffer in buffers if "uri" in buffer]
+    except (ValueError, LookupError, TypeError, RecursionError):
+        return []
 
 
 def read_mesh_measures(folder: Path, mesh: Path, scale: float) -> MeshMeasures | None:
@@ -70,7 +78,7 @@ def read_surface(folder: Path) -> NDArray[np.float64] | None:
     """Return the triangles of a built mesh in O [m], shape (F, 3, 3); None if there are none."""
     try:
         triangles = np.load(folder / SURFACE_FILE)
-    except (OSError, ValueError, EOFError):
+    except (OSError, ValueError, EOFError, MemoryError):
         return None
     if triangles.ndim != 3 or triangles.shape[1:] != (3, 3) or not np.isfinite(triangles).all():
         return None

@@ -299,7 +299,7 @@ class ObjectClass:
         files = sorted(self.folder.glob("convex_*.obj"))
         if not files:
             raise InputError(f"{self.folder}: class {self.name} has no assets; {remedy}")
-        pieces = tuple(np.asarray(trimesh.load_mesh(file).vertices, float) for file in files)
+        pieces = tuple(_read_piece(file, remedy) for file in files)
         if not np.allclose(np.ptp(np.vstack(pieces), axis=0), self.size, rtol=0.02, atol=1e-4):
             raise InputError(f"{self.folder}: was built from another mesh; {remedy}")
         return pieces
@@ -348,6 +348,15 @@ class Catalog:
                 f"object set {name!r} is unknown; known are {', '.join(self.object_sets)}"
             )
         return tuple(self.classes[class_name] for class_name in self.object_sets[name])
+
+
+def _read_piece(path: Path, remedy: str) -> NDArray[np.float64]:
+    """Return the corners of a convex piece of a built class [m]. Shape (V, 3)."""
+    with reading_file(path, f"a convex piece; {remedy}"):
+        corners = np.asarray(trimesh.load_mesh(path).vertices, float)
+        if len(corners) < 4 or not np.isfinite(corners).all():
+            raise ValueError("it has no corners, or some that are not finite")
+        return corners
 
 
 def _make_object_class(name: str, entry: ClassEntry, folder: Path, where: str) -> ObjectClass:

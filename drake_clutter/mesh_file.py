@@ -9,7 +9,10 @@ meters; of glTF files, they are those with z up.
 # trimesh is typed in part only.
 # mypy: allow-untyped-calls
 
-from collections.abc import Sequence
+import logging
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +24,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from drake_clutter.files import InputError
+from drake_clutter.files import InputError, reading_file
 
 Floats = NDArray[np.float64]
 """An array of floats."""
@@ -34,6 +37,9 @@ MAX_HOLE_SIZE = 0.02
 """Largest extent of a hole that a repair closes, as a fraction of the mesh's largest extent.
 
 Larger holes may be openings of a model that has no walls, which a lid would turn into a solid.
+"""
+MAX_TRIANGLES = 1_000_000
+"""Largest number of triangles, twice that of the finest published scans of household objects (YCB).
 """
 MIN_EXTENT = 0.003
 """Smallest extent of an object [m]."""
@@ -112,26 +118,56 @@ def format_point(point: Floats) -> str:
     return f"({', '.join(f'{value:.4g}' for value in point)})"
 
 
+@contextmanager
+def _reading_mesh(path: Path, where: str) -> Iterator[None]:
+    """Turn whatever the readers of meshes and images raise into an `InputError`.
+
+    What they log or warn of is either repaired, or in the message of the error.
+    """
+    logger = logging.getLogger("trimesh")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except InputError:
+        raise
+    except Exception as error:  # trimesh's readers raise whatever their formats suggest
+        reason = " ".join(str(error).split())[:140] or type(error).__name__
+        raise InputError(f"{where}: {path} cannot be read as a mesh ({reason})") from error
+    finally:
+        logger.setLevel(level)
+
+
 def _read_parts(path: Path, where: str, scale: float) -> list[tuple[str, trimesh.Trimesh]]:
     """Return the names and meshes of the parts of a file, z up and in meters."""
-    try:
-        scene = trimesh.load_scene(path, process=False)
-    except Exception as error:  # trimesh's readers raise whatever their formats suggest
-        raise InputError(f"{where}: {path} cannot be read as a mesh ({error})") from error
     parts = []
-    for node in sorted(scene.graph.nodes_geometry):
-        transform, geometry = scene.graph[node]
-        part = scene.geometry[geometry]
-        if isinstance(part, trimesh.Trimesh) and len(part.faces):
-            part = part.copy()
-            part.apply_transform(transform)
-            if path.suffix.lower() in _GLTF_SUFFIXES:
-                part.apply_transform(Y_UP_TO_Z_UP)
-            if scale != 1:
-                part.vertices = np.asarray(part.vertices, float) * scale
-            parts.append((str(node), part))
-    if not parts:
-        raise InputError(f"{where}: {path} cannot be read as a mesh (it has no triangles)")
+    with _reading_mesh(path, where), reading_file(path, "a mesh"):
+        scene = trimesh.load_scene(path, process=False)
+        for node in sorted(scene.graph.nodes_geometry):
+            transform, geometry = scene.graph[node]
+            part = scene.geometry[geometry]
+            if isinstance(part, trimesh.Trimesh) and len(part.faces):
+                faces, count = np.asarray(part.faces), len(part.vertices)
+                if faces.min() < 0 or faces.max() >= count:
+                    wrong = faces[(faces < 0) | (faces >= count)][0]
+                    raise ValueError(f"a triangle has vertex {wrong} of {count}")
+                part = part.copy()
+                part.apply_transform(transform)
+                if path.suffix.lower() in _GLTF_SUFFIXES:
+                    part.apply_transform(Y_UP_TO_Z_UP)
+                if scale != 1:
+                    part.vertices = np.asarray(part.vertices, float) * scale
+                parts.append((str(node), part))
+        num_triangles = sum(len(part.faces) for _, part in parts)
+        if not num_triangles:
+            raise ValueError("it has no triangles")
+    if num_triangles > MAX_TRIANGLES:
+        raise InputError(
+            f"{where}: {path} has {num_triangles} triangles; expected at most {MAX_TRIANGLES}, "
+            "simplify the mesh"
+        )
     return parts
 
 
@@ -357,6 +393,8 @@ def load_object_mesh(path: Path, where: str, scale: float = 1.0) -> ObjectMesh:
     part_ids = part_ids[kept]
     triangle_ids = triangle_ids[kept]
 
+    if not len(merged):
+        raise InputError(f"{where}: {path} has no triangle with an area; give a closed surface")
     names = [name for name, _ in parts]
     bodies = _find_bodies(merged, part_ids, names)
     surfaces = []

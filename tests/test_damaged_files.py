@@ -22,12 +22,18 @@ import h5py
 import numpy as np
 import pytest
 import torch
+import trimesh
 import yaml
-from conftest import DEFAULT_CELL, rng
+from conftest import DEFAULT_CELL, TRAY, rng
+from PIL import Image
+from pydrake.systems.framework import DiagramBuilder
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
+from test_collision_filters import arm
+from test_mesh_file import write_cube_with_seams
 from test_scene_file import DOCUMENT, SCENE
 from test_scene_file_fuzzed import SCENARIO, places
+from test_station_simulation import STATIC
 
 from drake_clutter.agents.behavior_cloning import BehaviorCloningConfig, BehaviorCloningLearner
 from drake_clutter.agents.episode_evaluation import EpisodeResult
@@ -41,6 +47,8 @@ from drake_clutter.agents.learned_generator import (
 )
 from drake_clutter.agents.ppo import PPOConfig, PPOLearner
 from drake_clutter.agents.soft_q import SoftQConfig, SoftQLearner
+from drake_clutter.assets import build_assets
+from drake_clutter.assets.mesh_appearance import textured_parts
 from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.work_cell import load_cell
 from drake_clutter.commands.feasibility_job import FeasibilityJob, StudyPart, load_part
@@ -51,6 +59,7 @@ from drake_clutter.files import MAX_ERROR_LENGTH, InputError, write_json
 from drake_clutter.grammar import SceneGrammar
 from drake_clutter.learning.checkpoint import save_checkpoint
 from drake_clutter.learning.training_run import TrainingRun
+from drake_clutter.mesh_file import load_object_mesh
 from drake_clutter.perception.image_dataset import (
     AnnotatedImage,
     ImageDataset,
@@ -61,17 +70,21 @@ from drake_clutter.perception.image_dataset import (
     write_images,
 )
 from drake_clutter.perception.segmentation import CHECKPOINT_KIND, SegmentationNetwork
+from drake_clutter.planning.collision_model import CollisionModel
 from drake_clutter.records import read_jsonl, resume_jsonl, write_jsonl
 from drake_clutter.resources import resource_path
+from drake_clutter.robots.model_parsing import read_model_text, read_torque_limits
+from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.interfaces import ArmState, MotionSample, Move, MoveResult, Outcome
 from drake_clutter.scenes.scene import Pose
 from drake_clutter.scenes.scene_dataset import _digest, load_scene_dataset
 from drake_clutter.scenes.scene_file import load_scene
+from drake_clutter.simulation.scene_plant import add_scene_plant
 from drake_clutter.station.trajectory_file import read_trajectories, write_trajectories
 from drake_clutter.systems.scenario import Scenario
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.generation_task import ClutterGeneration, GenerationTaskConfig
-from drake_clutter.validation import load_config_as, to_plain
+from drake_clutter.validation import load_config_as, override_config, to_plain
 from drake_clutter.yaml_io import to_yaml
 from training.evaluate_explorers import EpisodeRecord
 from training.results_file import ResultsFile
@@ -504,7 +517,74 @@ def feasibility_parts(folder: Path) -> Reader:
     return Reader([folder / part.file_name for part in parts], read)
 
 
+def mesh_files(folder: Path) -> Reader:
+    """Return a reader of meshes in all formats, with textures and vertex colors."""
+    box = trimesh.creation.box((0.06, 0.04, 0.03))
+    box.export(folder / "stl.stl")
+    textured = box.copy()
+    textured.unmerge_vertices()
+    uv = rng().random((len(textured.vertices), 2))
+    pixels = rng().integers(0, 256, (8, 8, 3), np.uint8)
+    textured.visual = trimesh.visual.TextureVisuals(uv=uv, image=Image.fromarray(pixels))  # type: ignore[no-untyped-call]
+    textured.export(folder / "glb.glb")
+    colored = box.copy()
+    colored.visual.vertex_colors = rng().integers(0, 256, (len(box.vertices), 4), np.uint8)
+    colored.export(folder / "ply.ply")
+    obj = write_cube_with_seams(folder)
+    meshes = [folder / "stl.stl", folder / "glb.glb", folder / "ply.ply", obj]
+
+    def read() -> None:
+        for path in meshes:
+            parts = load_object_mesh(path, f"{folder}: classes.brick.mesh")
+            if path.suffix != ".stl":
+                textured_parts(parts, path)
+
+    return Reader(sorted(path for path in folder.iterdir() if path.name != "catalog.yaml"), read)
+
+
+def own_catalog(folder: Path) -> Reader:
+    """Return a reader of an asset folder with a mesh."""
+    box = trimesh.creation.box((0.06, 0.04, 0.03))
+    box.export(folder / "brick.stl")
+    (folder / "catalog.yaml").write_text(
+        "classes:\n  brick: {shape: mesh, mesh: brick.stl, mass_g: 200}\n"
+    )
+    build_assets(folder)
+    names = ("mesh.json", "surface.npy", "convex_000.obj", "model.sdf")
+    built = [folder / "brick" / name for name in names]
+
+    def read() -> None:
+        load_catalog.cache_clear()
+        classes = load_catalog(folder).classes
+        if "brick" not in classes:
+            raise InputError(f"{folder}: no class")
+        brick = classes["brick"]
+        _ = brick.center_of_mass, brick.convex_pieces, brick.surface_triangles
+        builder = DiagramBuilder()
+        add_scene_plant(builder, [("brick", brick)], TRAY, 0.01, visuals=False)
+
+    return Reader([folder / "catalog.yaml", folder / "brick.stl", *built], read)
+
+
+def robot_files(folder: Path) -> Reader:
+    """Return a reader of an arm in URDF and a fixture in SDF."""
+    spec = arm(folder, "revolute", "0 0 1", 0.5)
+    post = folder / "post.sdf"
+    post.write_text(STATIC)
+    fixture = {"name": "post", "model": str(post), "pose": {"translation": [0.6, 0.0, 0.25]}}
+    cell = override_config(DEFAULT_CELL, {"robot": to_plain(spec), "fixtures": [fixture]}, "cell")
+
+    def read() -> None:
+        for cached in (load_robot, read_model_text, read_torque_limits):
+            cached.cache_clear()
+        load_robot(cell.robot)
+        CollisionModel(cell, [])
+
+    return Reader([Path(spec.model), post], read)
+
+
 READERS = [
+    *(mesh_files, own_catalog, robot_files),
     *(scene_file, config_file, cell_file, generator_checkpoint, explorer_checkpoint),
     *(detector_checkpoint, trajectory_file, soft_q_training, ppo_training, cloning_training),
     *(job_file, progress_file, scene_dataset, image_dataset, record_file, results_file),

@@ -19,6 +19,7 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection
 from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.cell.support import Support
 from drake_clutter.cell.support_sdf import support_sdf
+from drake_clutter.files import reading_file
 from drake_clutter.mesh_file import Y_UP_TO_Z_UP
 from drake_clutter.scenes.scene import Scene
 
@@ -100,9 +101,11 @@ def load_visual(object_class: ObjectClass) -> Any:
 
     It is a `trimesh.Trimesh` whose material is a `PBRMaterial` with the label as its texture.
     """
-    parts = trimesh.load_scene(object_class.folder / "visual.gltf").geometry.values()
-    mesh = trimesh.util.concatenate(list(parts))  # packs the textures of several parts into one
-    mesh.apply_transform(Y_UP_TO_Z_UP)
+    path = object_class.folder / "visual.gltf"
+    with reading_file(path, "a model as `drake-clutter assets build` writes it"):
+        parts = trimesh.load_scene(path).geometry.values()
+        mesh = trimesh.util.concatenate(list(parts))  # packs the textures of several parts into one
+        mesh.apply_transform(Y_UP_TO_Z_UP)
     return mesh
 
 
@@ -129,7 +132,8 @@ def deflate_convex_mesh(path: Path, deflated: Path, margin: float) -> None:
         margin: Distance of the faces from those of the mesh [m].
     """
     # Each row is a face: outer normal n and offset d with n @ p + d <= 0 inside.
-    faces = ConvexHull(trimesh.load_mesh(path).vertices).equations
+    with reading_file(path, "a convex piece as `drake-clutter assets build` writes it"):
+        faces = ConvexHull(trimesh.load_mesh(path).vertices).equations
     faces[:, 3] += margin
     # The center and radius of the largest ball between the faces.
     ball = linprog(

@@ -27,6 +27,7 @@ from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.pinhole import MAX_DEPTH
 from drake_clutter.cell.support import Support
+from drake_clutter.files import reading_file
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.scene_plant import ScenePlant, add_scene_plant, rigid_transform
 
@@ -149,7 +150,11 @@ class CameraRenderer:
         names = [(f"{c.name}.{k}", c) for c, count in counts.items() for k in range(count)]
         self._scene_plant: ScenePlant = add_scene_plant(builder, names, support, 0.01, visuals=True)
         self._scene_plant.plant.Finalize()
-        self._scene_plant.scene_graph.AddRenderer(RENDERER_NAME, MakeRenderEngineVtk(self._engine))
+        visuals = " or ".join(sorted({str(c.folder / "visual.gltf") for c in counts}))
+        with reading_file(visuals, "models as `drake-clutter assets build` writes them"):
+            self._scene_plant.scene_graph.AddRenderer(
+                RENDERER_NAME, MakeRenderEngineVtk(self._engine)
+            )
         self._diagram = builder.Build()
         self._context = self._diagram.CreateDefaultContext()
         self._counts = counts

@@ -32,6 +32,7 @@ from drake_clutter.catalog import ObjectClass, RestOrientation, Shape
 from drake_clutter.cell.sdf_text import read_sdf_text
 from drake_clutter.cell.support import Support
 from drake_clutter.cell.support_sdf import support_sdf, table_box
+from drake_clutter.files import reading_file
 from drake_clutter.scenes.scene import Pose, SceneObject
 
 ROLLING_DAMPING_TIME = 0.05
@@ -210,9 +211,11 @@ def add_objects(
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("tray", tray))
     bodies = {}
     for name, object_class in objects:
-        text = read_sdf_text(object_class.verified_sdf_path, visuals=visuals)
-        (instance,) = Parser(plant, model_name_prefix=name).AddModelsFromString(text, "sdf")
-        bodies[name] = plant.GetBodyByName("body", instance)
+        path = object_class.verified_sdf_path
+        with reading_file(path, "a model as `drake-clutter assets build` writes it"):
+            text = read_sdf_text(path, visuals=visuals)
+            (instance,) = Parser(plant, model_name_prefix=name).AddModelsFromString(text, "sdf")
+            bodies[name] = plant.GetBodyByName("body", instance)
         if (
             name != object_with_joint
             and object_class.shape is Shape.CYLINDER
