@@ -71,6 +71,15 @@ from .agents.backend_factory import make_backend_factory as make_backend_factory
 from .agents.explorers import make_policy_factory as make_policy_factory
 
 # Motion planning and arm simulation.
+from .planning.motion_plan import (
+    CellState as CellState,
+    HeldObject as HeldObject,
+    MotionPlan as MotionPlan,
+    PlanStep as PlanStep,
+    concatenate_plans as concatenate_plans,
+    plan_from_steps as plan_from_steps,
+    stay_at as stay_at,
+)
 from .planning.pick_place_plan import (
     PickPlacePlan as PickPlacePlan,
     PlanningFailure as PlanningFailure,

@@ -18,7 +18,12 @@ from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.planning.pick_place_plan import PickPlacePlan
+from drake_clutter.planning.motion_plan import DWELL_TIME
+from drake_clutter.planning.pick_place_plan import (
+    PickPlacePlan,
+    PlanningFailure,
+    PlanningFailureReason,
+)
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.reports.filmstrip import (
@@ -31,7 +36,7 @@ from drake_clutter.scenes.interfaces import Move, MoveResult
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.station.arm_executor import ArmExecutor, evaluate_outcome
 from drake_clutter.station.clutter_station import ClutterStation
-from drake_clutter.station.command_schedule import DWELL_TIME, build_command_schedule
+from drake_clutter.station.command_schedule import build_command_schedule
 from drake_clutter.station.grasp_constraint import WeldPair
 from drake_clutter.station.messages import ExecutorStatus, PlannedMove
 from drake_clutter.station.pick_place_executor import PickPlaceExecutor
@@ -173,7 +178,7 @@ def test_later_moves_are_not_blamed_for_an_object_beside_the_tray(config: Clutte
 
 def test_stages_of_the_command_schedule(plan: PickPlacePlan) -> None:
     schedule = build_command_schedule(plan, DEFAULT_CELL)
-    assert [name for name, _ in schedule.stage_starts] == [
+    assert [step.name for step in schedule.steps] == [
         "approach",
         "grasp",
         "carry",
@@ -362,12 +367,21 @@ def test_images_are_rendered_from_the_side_opposite_the_base() -> None:
 
 
 def test_an_object_placed_on_an_edge_falls() -> None:
-    """A box that is released on the edge of a slim one falls."""
+    """A box that is released on the edge of a slim one falls.
+
+    The planner refuses that, unless it takes the slim one for two.
+    """
     scene = scene_of(
         resting("sugar_box", Orientation.UPRIGHT_0), resting("gelatin_box", xy=(0.15, 0.0))
     )
     X_TO_edge = Pose((0.0, 0.03, 0.175 + 0.014 + 0.001), scene["gelatin_box"].X_TO.quaternion)
-    plan = planned(scene, "gelatin_box", X_TO_edge)
+    planner = PickPlacePlanner(DEFAULT_CELL, PlannerConfig())
+    refused = planner.plan(scene.objects, "gelatin_box", X_TO_edge)
+    assert isinstance(refused, PlanningFailure)
+    assert refused.reason is PlanningFailureReason.PLACE_OFF_BALANCE
+    assert refused.value == pytest.approx(0.03 - 0.038 / 2, abs=1e-6)
+    imagined = resting("sugar_box", Orientation.UPRIGHT_0, (0.0, 0.05), name="imagined")
+    plan = planned(scene_of(*scene.objects, imagined), "gelatin_box", X_TO_edge)
     result = StationSimulation(DEFAULT_CELL, scene).execute(plan)
     assert result.grasped
     assert result.poses["gelatin_box"].translation[2] < 0.1

@@ -7,12 +7,13 @@ from conftest import DEFAULT_CELL, resting, scene_of
 from test_clutter_station import HOME, TOOL, station_at_home
 
 from drake_clutter.grammar import Orientation
+from drake_clutter.planning.motion_plan import DWELL_TIME
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.scenes.scene import Pose
 from drake_clutter.station.body_sleep import BodySleepManager, affected_bodies, bodies_to_wake
-from drake_clutter.station.command_schedule import DWELL_TIME, build_command_schedule
+from drake_clutter.station.command_schedule import build_command_schedule
 from drake_clutter.station.gripper_actuator import GraspStatus
 from drake_clutter.station.station_simulation import STEP_PERIOD
 
@@ -40,24 +41,28 @@ def plan() -> PickPlacePlan:
 
 
 def test_an_object_that_is_reached_late_in_a_descent_is_affected(plan: PickPlacePlan) -> None:
-    at_pick, at_place = affected_bodies(SCENE.objects, plan)
-    assert at_pick == {PICKED.name}
-    assert at_place == {PICKED.name, SUPPORT.name}
+    affected = affected_bodies(SCENE.objects, plan)
+    by_step = {step.name: names for step, names in zip(plan.steps, affected, strict=True) if names}
+    at_place = {PICKED.name, SUPPORT.name}
+    assert by_step == {"grasp": {PICKED.name}, "descend": at_place, "release": at_place}
 
 
 def test_objects_are_woken_around_pick_and_place(plan: PickPlacePlan) -> None:
     schedule = build_command_schedule(plan, DEFAULT_CELL)
-    carried = (schedule.grasp_time + DWELL_TIME + schedule.descent_start_time) / 2
+    descent_start = schedule.start_of("descend")
+    carried = (schedule.grasp_time + DWELL_TIME + descent_start) / 2
+    at_place = {"descend": {"place"}, "release": {"place"}}
+    affected = [({"grasp": {"pick"}} | at_place).get(step.name, set()) for step in plan.steps]
     for time, expected in (
         (0.0, set()),
         (schedule.grasp_time, {"pick"}),
         (schedule.grasp_time + DWELL_TIME, {"pick"}),
         (carried, set()),
-        (schedule.descent_start_time, {"place"}),
+        (descent_start, {"place"}),
         (schedule.release_time, {"place"}),
         (schedule.end_time, set()),
     ):
-        assert bodies_to_wake(schedule, {"pick"}, {"place"}, time) == expected, time
+        assert bodies_to_wake(schedule, affected, time) == expected, time
 
 
 @pytest.mark.parametrize(

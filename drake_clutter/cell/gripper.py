@@ -123,6 +123,7 @@ class GraspFailureReason(Enum):
     NO_SEAL = "no seal"
     NO_OPPOSED_FACES = "no opposed faces"
     TOO_HEAVY = "too heavy"
+    TOO_WEAK = "grasp too weak"
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,8 @@ class GraspFailure:
         reason: Failure of the sampled grasp that came closest to being feasible.
         value: Flatness deviation or gap under the best grasp [m] if no grasp seals, distance of the
             narrowest opposed faces or height [m] if none are between the jaws, or mass of the
-            object [kg] if it is too heavy.
+            object [kg] if it is too heavy; of a given grasp that is too weak the acceleration that
+            it bears [m/s^2], negative if it does not hold the object at rest.
     """
 
     reason: GraspFailureReason
@@ -209,6 +211,24 @@ class Gripper(Protocol):
             object_class: Class of the object.
             X_TO: Pose of the object.
             sampling: Parameters of the sampling.
+        """
+
+    def make_grasp(
+        self,
+        tool: str,
+        object_class: ObjectClass,
+        X_TO: RigidTransform,
+        X_TG: RigidTransform,
+        sampling: GraspSampling,
+    ) -> Grasp | GraspFailure:
+        """Return the grasp at a given pose of a tool, or why it does not hold the object.
+
+        Args:
+            tool: Name of the tool.
+            object_class: Class of the object.
+            X_TO: Pose of the object.
+            X_TG: Pose of the tool: of a cup with its origin on the surface of the object.
+            sampling: Gap and acceleration that count for sampled grasps, too.
         """
 
     def max_acceleration(self, tool: str, mass: float, p_GCm: Floats, down_G: Floats) -> float:

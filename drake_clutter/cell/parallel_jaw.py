@@ -10,6 +10,7 @@ arcs of 14 mm height; size of pads, jaws and palm; friction of the pads.
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -27,7 +28,7 @@ from drake_clutter.cell.gripper import (
     Tool,
 )
 from drake_clutter.cell.jaw_sdf import JawGeometry, jaw_sdf
-from drake_clutter.cell.payload_limits import DOWN_G, max_payload_acceleration
+from drake_clutter.cell.payload_limits import max_payload_acceleration
 from drake_clutter.validation import InRange, StrictModel
 
 Floats = NDArray[np.float64]
@@ -125,30 +126,71 @@ class ParallelJawGripper(StrictModel):
             y = np.array([*(direction[:2] / np.linalg.norm(direction[:2])), 0.0])
             R_TG = RotationMatrix(np.column_stack([np.cross(y, z), y, z]))
             X_TG = RigidTransform(R_TG, [*X_TO.translation()[:2], height])
-            p_GCm = X_TG.inverse() @ p_TCm
-            acceleration = self.max_acceleration(JAWS, object_class.mass, p_GCm, DOWN_G)
-            if acceleration < sampling.min_payload_acceleration:
-                continue
-            x_F, y_F, z_F = (self.geometry.X_FG @ np.round(p_GCm, 2)).tolist()
-            payload = Payload(object_class.mass, (x_F, y_F, z_F), round(acceleration, 1))
-            held = (self.stroke - width) / 2
-            grasps.append(
-                Grasp(
-                    JAWS,
-                    X_TG,
-                    payload,
-                    num_angles=2,
-                    insertion=top - height + self.geometry.pad_size[2] / 2,
-                    joints_open=(held - self.clearance,) * 2,
-                    joints_held=(held,) * 2,
-                )
-            )
+            grasp = self._grasp_at(object_class, X_TG, p_TCm, width, top)
+            if grasp.payload.max_acceleration >= sampling.min_payload_acceleration:
+                grasps.append(replace(grasp, num_angles=2))
         if grasps:
             return tuple(grasps[: sampling.max_grasps])
         narrowest = min(widths, default=math.inf)
         if narrowest + 2 * self.clearance > self.stroke:
             return GraspFailure(GraspFailureReason.NO_OPPOSED_FACES, narrowest)
         return GraspFailure(GraspFailureReason.TOO_HEAVY, object_class.mass)
+
+    def _grasp_at(
+        self,
+        object_class: ObjectClass,
+        X_TG: RigidTransform,
+        p_TCm: Floats,
+        width: float,
+        top: float,
+    ) -> Grasp:
+        """Return the grasp at a pose of the jaws.
+
+        Args:
+            object_class: Class of the object.
+            X_TG: Pose of the jaws.
+            p_TCm: Center of mass of the object [m]. Shape (3,).
+            width: Distance of the opposed faces [m].
+            top: Height of the object's highest point [m].
+        """
+        p_GCm = X_TG.inverse() @ p_TCm
+        down_G = -X_TG.rotation().matrix()[2]
+        acceleration = self.max_acceleration(JAWS, object_class.mass, p_GCm, down_G)
+        x_F, y_F, z_F = (self.geometry.X_FG @ np.round(p_GCm, 2)).tolist()
+        held = (self.stroke - width) / 2
+        return Grasp(
+            JAWS,
+            X_TG,
+            Payload(object_class.mass, (x_F, y_F, z_F), round(acceleration, 1)),
+            num_angles=1,
+            insertion=max(0.0, top - X_TG.translation()[2] + self.geometry.pad_size[2] / 2),
+            joints_open=(held - self.clearance,) * 2,
+            joints_held=(held,) * 2,
+        )
+
+    def make_grasp(
+        self,
+        tool: str,
+        object_class: ObjectClass,
+        X_TO: RigidTransform,
+        X_TG: RigidTransform,
+        sampling: GraspSampling,
+    ) -> Grasp | GraspFailure:
+        """Return the grasp at a given pose of the jaws, see `Gripper`."""
+        X_OG = X_TO.InvertAndCompose(X_TG)
+        corners_T = X_TO.multiply(object_class.corners.T).T
+        across = corners_T @ X_TG.rotation().matrix()[:, 1]
+        width = float(np.ptp(across))
+        is_between = self.can_attach(tool, object_class, X_OG)
+        if width + 2 * self.clearance > self.stroke or not is_between:
+            return GraspFailure(GraspFailureReason.NO_OPPOSED_FACES, width)
+        p_TCm = X_TO @ object_class.center_of_mass
+        top = float(corners_T[:, 2].max())
+        grasp = self._grasp_at(object_class, X_TG, p_TCm, width, top)
+        if grasp.payload.max_acceleration < sampling.min_payload_acceleration:
+            acceleration = grasp.payload.max_acceleration
+            return GraspFailure(GraspFailureReason.TOO_WEAK, acceleration)
+        return grasp
 
     def can_attach(self, tool: str, object_class: ObjectClass, X_OG: RigidTransform) -> bool:
         """Return whether an object is between the pads and narrower than the stroke."""

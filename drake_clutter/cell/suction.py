@@ -186,21 +186,51 @@ class SuctionGripper(StrictModel):
             profile = lip_surface_profile(object_class, X_OG, cup.diameter) + sampling.lip_gap
             if not self._seals(profile, cup.diameter):
                 if cup.name in mismatches:
-                    deviation = profile_deviation(profile, cup.diameter)
-                    is_uneven = deviation > self.unevenness
-                    value = deviation if is_uneven else float(profile.min())
-                    mismatches[cup.name] = min(mismatches[cup.name], (is_uneven, value))
+                    mismatch = self._mismatch(profile, cup.diameter)
+                    mismatches[cup.name] = min(mismatches[cup.name], mismatch)
                 continue
             mismatches.pop(cup.name, None)
-            p_GCm = X_TG.inverse() @ p_TCm
-            down_G = -X_TG.rotation().matrix()[2]
-            acceleration = self.max_acceleration(cup.name, object_class.mass, p_GCm, down_G)
-            if acceleration >= sampling.min_payload_acceleration:
-                # The offset of the load from the axis depends on the yaw, and is neglected.
-                p_GCm = (0.0, 0.0, round(float(p_GCm[2]), 2))
-                a, b, c = (cup.X_FG.transform @ np.array(p_GCm)).tolist()
-                payload = Payload(object_class.mass, (a, b, c), acceleration)
+            payload = self._payload(cup, object_class, X_TG.inverse() @ p_TCm, X_TG)
+            if payload.max_acceleration >= sampling.min_payload_acceleration:
                 yield Grasp(cup.name, X_TG, payload)
+
+    def _payload(
+        self, cup: SuctionCup, object_class: ObjectClass, p_GCm: Floats, X_TG: RigidTransform
+    ) -> Payload:
+        """Return the load of an object with its center of mass at p_GCm [m], shape (3,)."""
+        down_G = -X_TG.rotation().matrix()[2]
+        acceleration = self.max_acceleration(cup.name, object_class.mass, p_GCm, down_G)
+        # The offset of the load from the axis depends on the yaw, and is neglected.
+        on_axis = np.array([0.0, 0.0, round(float(p_GCm[2]), 2)])
+        a, b, c = (cup.X_FG.transform @ on_axis).tolist()
+        return Payload(object_class.mass, (a, b, c), acceleration)
+
+    def _mismatch(self, profile: Floats, diameter: float) -> _Mismatch:
+        """Return the mismatch of a profile that does not seal, see `_Mismatch`."""
+        deviation = profile_deviation(profile, diameter)
+        is_uneven = deviation > self.unevenness
+        return is_uneven, deviation if is_uneven else float(profile.min())
+
+    def make_grasp(
+        self,
+        tool: str,
+        object_class: ObjectClass,
+        X_TO: RigidTransform,
+        X_TG: RigidTransform,
+        sampling: GraspSampling,
+    ) -> Grasp | GraspFailure:
+        """Return the grasp at a given pose of a cup, see `Gripper`."""
+        cup = self.cup(tool)
+        X_OG = X_TO.InvertAndCompose(X_TG)
+        profile = lip_surface_profile(object_class, X_OG, cup.diameter) + sampling.lip_gap
+        if not self._seals(profile, cup.diameter):
+            value = self._mismatch(profile, cup.diameter)[1]
+            return GraspFailure(GraspFailureReason.NO_SEAL, value)
+        p_GCm = X_TG.inverse() @ (X_TO @ object_class.center_of_mass)
+        payload = self._payload(cup, object_class, p_GCm, X_TG)
+        if payload.max_acceleration < sampling.min_payload_acceleration:
+            return GraspFailure(GraspFailureReason.TOO_WEAK, payload.max_acceleration)
+        return Grasp(tool, X_TG, payload, num_angles=1)
 
     def can_attach(self, tool: str, object_class: ObjectClass, X_OG: RigidTransform) -> bool:
         """Return whether the lip seals on the surface at a pose, see `Gripper`."""

@@ -8,20 +8,29 @@ guarded descent may follow `carry`. It lowers an object of uncertain height unti
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.trajectories import BsplineTrajectory, Trajectory
+from pydrake.trajectories import (
+    BsplineTrajectory,
+    PathParameterizedTrajectory,
+    PiecewisePolynomial,
+    Trajectory,
+)
 
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.planning.collision_model import SignedDistance
+from drake_clutter.planning.motion_plan import CellState, HeldObject, PlanStep, stay_at
 from drake_clutter.scenes.scene import Pose
 
 DESCENT_SPEED = 0.02
 """Largest speed of a guarded descent [m/s]: 0.5 mm between two contact checks of the executor."""
+
+_DESCENT_STEP = 0.01
+"""Height step at which contacts along a guarded descent are searched [m]."""
 
 
 class PlanningFailureReason(Enum):
@@ -39,6 +48,8 @@ class PlanningFailureReason(Enum):
     UNREACHABLE = "unreachable"
     IN_COLLISION = "in collision"
     TRAJECTORY_INFEASIBLE = "trajectory infeasible"
+    JOINT_LIMIT = "joint limit"
+    GRASP_TOO_WEAK = "grasp too weak"
     TIME_OUT = "time out"
 
 
@@ -53,7 +64,9 @@ class PlanningFailure:
         value: Quantity that the reason refers to: flatness deviation of the surface under the best
             grasp [m], mass [kg], signed distance [m], tilt [rad] or time [s]; of a place pose the
             depth of penetration [m], the tilt [rad], the gap to what is below [m] or the distance
-            of the center of mass from the contact area [m]. NaN if there is none.
+            of the center of mass from the contact area [m]; of a configuration the excess of a
+            joint [rad]; of a weak grasp the acceleration that it bears [m/s^2]. NaN if there is
+            none.
         planning_time: Wall time spent [s].
     """
 
@@ -151,11 +164,9 @@ class PickPlacePlan:
         pick: Name of the object.
         X_TO_pick: Pose of the object before the move.
         X_TO_place: Pose at which the object is released, without guarded descent.
-        tool: Name of the tool that holds the object.
-        X_OG: Grasp: pose of the tool in the object.
-        joints_open: Positions of the gripper's joints without the object, see `Grasp` [m].
-        joints_held: Positions of the gripper's joints with the object, see `Grasp` [m].
-        payload: Load while the object is held.
+        held: The object while a tool holds it.
+        start: State at the start.
+        end: State at the end, without guarded descent.
         segments: `approach`, `carry` and `retreat`.
         num_attempts: Number of combinations of grasp, inverse kinematics solution and transfer
             height that were tried.
@@ -167,15 +178,61 @@ class PickPlacePlan:
     pick: str
     X_TO_pick: Pose
     X_TO_place: Pose
-    tool: str
-    X_OG: RigidTransform
-    joints_open: tuple[float, ...]
-    joints_held: tuple[float, ...]
-    payload: Payload
+    held: HeldObject
+    start: CellState = field(repr=False)
+    end: CellState = field(repr=False)
     segments: tuple[TrajectorySegment, ...]
     num_attempts: int
     planning_time: float
     guarded_descent: GuardedDescent | None = None
+
+    @property
+    def tool(self) -> str:
+        """Name of the tool that holds the object."""
+        return self.held.tool
+
+    @property
+    def X_OG(self) -> RigidTransform:
+        """Grasp: pose of the tool in the object."""
+        return self.held.X_OG
+
+    @property
+    def payload(self) -> Payload:
+        """Load while the object is held."""
+        return self.held.payload
+
+    @property
+    def joints_open(self) -> tuple[float, ...]:
+        """Positions of the gripper's joints without the object, see `Grasp` [m]."""
+        return self.held.joints_open
+
+    @property
+    def joints_held(self) -> tuple[float, ...]:
+        """Positions of the gripper's joints with the object, see `Grasp` [m]."""
+        return self.held.joints_held
+
+    @property
+    def steps(self) -> tuple[PlanStep, ...]:
+        """Steps with dwells at grasp and release, and the whole guarded descent."""
+        return self.steps_until(math.inf)
+
+    def steps_until(self, contact_time: float) -> tuple[PlanStep, ...]:
+        """Return the steps of a plan whose guarded descent ends at contact.
+
+        Args:
+            contact_time: Time since the start of the guarded descent at which it ends [s]. The arm
+                then releases the object and rises by the same distance.
+        """
+        approach, carry, retreat = (segment.trajectory for segment in self.segments)
+        descent = self.guarded_descent.trajectory if self.guarded_descent else None
+        return (
+            PlanStep("approach", approach, joints=self.joints_open),
+            *grasp_and_carry(self.held, carry, "carry", self.X_TO_pick),
+            *release_steps(
+                self.held, self.X_TO_place, carry, descent, self.max_descent, contact_time
+            ),
+            PlanStep("retreat", retreat, joints=self.joints_open),
+        )
 
     @property
     def duration(self) -> float:
@@ -197,6 +254,77 @@ class PickPlacePlan:
     def __deepcopy__(self, memo: object) -> "PickPlacePlan":
         """Return the plan itself: it is immutable, and Drake copies abstract values often."""
         return self
+
+
+def grasp_and_carry(
+    held: HeldObject, trajectory: Trajectory, name: str, X_TO_pick: Pose
+) -> tuple[PlanStep, ...]:
+    """Return the dwell in which an object is grasped, and the motion that follows.
+
+    Args:
+        held: The object.
+        trajectory: Motion with the object.
+        name: Name of that motion.
+        X_TO_pick: Pose of the object at the grasp.
+    """
+    closed = held.joints_closed
+    q = trajectory.value(0.0).ravel()
+    return (
+        PlanStep("grasp", stay_at(q), Payload(), held.tool, closed, held.name, (X_TO_pick,)),
+        PlanStep(name, trajectory, held.payload, held.tool, closed),
+    )
+
+
+def release_steps(
+    held: HeldObject,
+    X_TO_place: Pose,
+    carry: Trajectory,
+    descent: Trajectory | None = None,
+    max_descent: float = 0.0,
+    contact_time: float = math.inf,
+) -> tuple[PlanStep, ...]:
+    """Return the dwell in which an object is released, with the guarded descent around it.
+
+    Args:
+        held: The object.
+        X_TO_place: Pose of the object before the descent.
+        carry: Motion that ends at that pose.
+        descent: Guarded descent; None without one.
+        max_descent: Distance of the descent [m].
+        contact_time: See `PickPlacePlan.steps_until`.
+    """
+    q = carry.value(carry.end_time()).ravel()
+    closed = held.joints_closed
+    num_heights = math.ceil(max_descent / _DESCENT_STEP) + 1
+    touched = tuple(
+        X_TO_place.translated((0.0, 0.0, -height))
+        for height in np.linspace(0.0, max_descent, num_heights).tolist()
+    )
+    if descent is None:
+        dwell = stay_at(q)
+        return (PlanStep("release", dwell, held.payload, "", held.joints_open, held.name, touched),)
+    lowered = _truncate(descent, contact_time)
+    dwell = stay_at(lowered.value(lowered.end_time()).ravel())
+    return (
+        PlanStep("steady", stay_at(q), held.payload, held.tool, closed),
+        PlanStep("descend", lowered, held.payload, held.tool, closed, held.name, touched),
+        PlanStep("release", dwell, held.payload, "", held.joints_open, held.name, touched),
+        PlanStep("rise", _reverse(lowered), Payload(), "", held.joints_open),
+    )
+
+
+def _truncate(trajectory: Trajectory, time: float) -> Trajectory:
+    """Return a trajectory up to a time [s]."""
+    end = min(time, trajectory.end_time())
+    scaling = PiecewisePolynomial.FirstOrderHold([0.0, end], [[0.0, end]])
+    return PathParameterizedTrajectory(trajectory, scaling)
+
+
+def _reverse(trajectory: Trajectory) -> Trajectory:
+    """Return a trajectory traversed backwards."""
+    end = trajectory.end_time()
+    scaling = PiecewisePolynomial.FirstOrderHold([0.0, end], [[end, 0.0]])
+    return PathParameterizedTrajectory(trajectory, scaling)
 
 
 def plan_to_dict(plan: PickPlacePlan | PlanningFailure) -> dict[str, Any]:

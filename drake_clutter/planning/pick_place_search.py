@@ -5,7 +5,7 @@ Frames: T is the support, G is a tool of the gripper, O is the picked object.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,10 @@ from drake_clutter.cell.gripper import Grasp, Payload
 from drake_clutter.cell.support_sdf import FLOOR
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.collision_model import CollisionModel
+from drake_clutter.planning.motion_plan import CellState, HeldObject
 from drake_clutter.planning.pick_place_plan import (
     FailureLog,
-    PickPlacePlan,
+    GuardedDescent,
     PlanningFailureReason,
     TrajectorySegment,
 )
@@ -30,6 +31,7 @@ from drake_clutter.planning.segment_planner import (
 )
 from drake_clutter.planning.time_parameterization import min_travel_time
 from drake_clutter.planning.tool_kinematics import (
+    CarryPath,
     ToolKinematics,
     invert_pose,
     is_vertical,
@@ -47,8 +49,46 @@ def _to_matrix(X_AB: RigidTransform) -> Floats:
     return np.ascontiguousarray(X_AB.GetAsMatrix4())
 
 
+@dataclass(frozen=True)
+class MoveGoal:
+    """Motion of one object that is searched for.
+
+    Attributes:
+        picked: Object at its pose at the start, which the tool picks or holds.
+        X_TO_place: Pose to which the object is carried; None to lift it above its place.
+        lift_height: Height by which it is lifted at least [m].
+        releases: Whether the object is released at the end.
+        end: Joint positions at the end; None if the arm stays above the released object, or if
+            inverse kinematics decides. Shape (n,).
+    """
+
+    picked: SceneObject
+    X_TO_place: Pose | None
+    lift_height: float
+    releases: bool
+    end: Floats | None
+
+
+@dataclass(frozen=True)
+class FoundMove:
+    """Motion of one object.
+
+    Attributes:
+        held: The object while the tool holds it.
+        segments: `approach`, `carry` and `retreat` as far as they are part of the motion, by name.
+        guarded_descent: Descent from the place pose; None without one.
+    """
+
+    held: HeldObject
+    segments: Mapping[str, TrajectorySegment]
+    guarded_descent: GuardedDescent | None
+
+
 class PickPlaceSearch:
     """Search for a plan of one move.
+
+    A move has up to three segments. An object that is held at the start has no approach, one that
+    is held at the end no retreat.
 
     Attributes:
         num_attempts: Number of combinations of grasp, IK solution and transfer height tried so far.
@@ -61,9 +101,8 @@ class PickPlaceSearch:
         config: PlannerConfig,
         tools: Mapping[str, ToolKinematics],
         collision_model: CollisionModel,
-        objects: Sequence[SceneObject],
-        picked: SceneObject,
-        X_TO_place: Pose,
+        state: CellState,
+        goal: MoveGoal,
         obstacle_tops: Sequence[float] = (),
     ) -> None:
         """Prepare the search.
@@ -73,32 +112,43 @@ class PickPlaceSearch:
             config: Parameters of the planner.
             tools: Kinematics of robot and tool, by name of the tool.
             collision_model: Collision model with the objects at their poses.
-            objects: All known objects, including the picked one.
-            picked: Object to pick.
-            X_TO_place: Pose at which the object is released.
+            state: State at the start, with all known objects.
+            goal: Motion of an object.
             obstacle_tops: Heights of the highest points of fixtures and occluded volumes [m].
         """
         self._cell = cell
         self._config = config
-        self._picked = picked
+        self._goal = goal
+        self._picked = picked = goal.picked
         self._tools = tools
         self._robot = load_robot(cell.robot)
-        self._X_TO_goal = X_TO_place
+        self._start = np.array(state.q)
+        self._is_held = state.held is not None
+        self._X_TO_goal = X_TO_place = goal.X_TO_place or picked.X_TO
         self._X_TO = _to_matrix(rigid_transform(picked.X_TO))
         self._X_TO_place = _to_matrix(rigid_transform(X_TO_place))
         self.num_attempts = 0
         self.failures = FailureLog()
         self._segments = SegmentPlanner(
-            cell, config, tools, collision_model, picked, X_TO_place, self.failures
+            cell,
+            config,
+            tools,
+            collision_model,
+            picked,
+            X_TO_place,
+            None if self._is_held else self._start,
+            goal.releases,
+            goal.end,
+            self.failures,
         )
         placed = replace(picked, X_TO=X_TO_place)
-        self._others = [o for o in objects if o is not picked]
+        self._others = [o for o in state.objects if o.name != picked.name]
         # Heights of the object's bottom: above its pick and place pose, or above a higher obstacle.
         self._place_bottom = placed.bounds_T[0][2]
         bottom = max(picked.bounds_T[0][2], self._place_bottom)
         all_tops = (*obstacle_tops, *(o.top_height for o in self._others))
         tops = sorted({round(top, 3) for top in all_tops if top > bottom})
-        lift_height = self._config.lift_height
+        lift_height = goal.lift_height
         self._transfer_heights = [bottom + lift_height]
         self._transfer_heights += [top + lift_height for top in tops if top > bottom]
 
@@ -108,26 +158,25 @@ class PickPlaceSearch:
         Returns:
             Candidates; the one with the shortest travel time first.
         """
-        home = self._robot.home
         tool = self._tools[grasp.tool]
         num_yaws = grasp.num_angles or self._config.num_yaws
         yaws = np.arange(num_yaws) * (2 * math.pi / num_yaws)
-        X_pick = [self._gripper_pose_at_pick(grasp, yaw) for yaw in yaws]
+        if self._is_held:
+            X_pick = [tool.pose(self._start)]
+        else:
+            X_pick = [self._gripper_pose_at_pick(grasp, yaw) for yaw in yaws]
         X_place = [self._gripper_pose_at_place(X) for X in X_pick]
-        q_pick = tool.solve_ik(np.array(X_pick))
-        q_place = tool.solve_ik(np.array(X_place))
-        q_place = self._robot.ik.match(q_pick, q_place)
-        is_pick_reachable = np.isfinite(q_pick[..., 0])
-        if (is_pick_reachable & ~np.isfinite(q_place[..., 0])).any():
-            self.failures.record(0, PlanningFailureReason.UNREACHABLE, "the place")
-        q_pick = self._robot.unwrap(q_pick, home)
-        q_place = self._robot.unwrap(q_place, q_pick)
-        displacements = np.array([q_pick - home, q_place - q_pick, q_place - home])
+        q_pick, q_place = self._solve_endpoints(tool, np.array(X_pick), np.array(X_place))
+        legs = [q_place - q_pick]
+        if not self._is_held:
+            legs.insert(0, q_pick - self._start)
+        if self._goal.releases and self._goal.end is not None:
+            legs.append(q_place - self._goal.end)
         with np.errstate(invalid="ignore"):
-            travel_time = min_travel_time(displacements, self._robot).sum(axis=0)
+            travel_time = min_travel_time(np.array(legs), self._robot).sum(axis=0)
         order = np.argsort(travel_time, axis=None, kind="stable")  # unreachable (NaN) last
         num_candidates = np.isfinite(travel_time).sum()
-        num_solutions = self._robot.ik.num_solutions
+        num_solutions = travel_time.shape[1]
         indices = [divmod(int(k), num_solutions) for k in order[:num_candidates]]
         candidates = list[GraspCandidate]()
         for k in indices:
@@ -153,6 +202,33 @@ class PickPlaceSearch:
                 )
             )
         return candidates
+
+    def _solve_endpoints(
+        self, tool: ToolKinematics, X_pick: Floats, X_place: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return joint positions at the grasps and at the place poses; NaN where unreachable.
+
+        Args:
+            tool: Kinematics of the tool.
+            X_pick: Poses of the tool at the grasp. Shape (m, 4, 4).
+            X_place: Poses of the tool at the place pose. Shape (m, 4, 4).
+
+        Returns:
+            Solutions in rows of the same branch. Shapes (m, K, n).
+        """
+        if self._is_held and not self._goal.releases and self._goal.end is not None:
+            return self._start[None, None], self._goal.end[None, None]
+        q_place = tool.solve_ik(X_place)
+        if self._is_held:
+            q_pick = np.broadcast_to(self._start, q_place.shape)
+        else:
+            q_pick = tool.solve_ik(X_pick)
+            q_place = self._robot.ik.match(q_pick, q_place)
+        if (np.isfinite(q_pick[..., 0]) & ~np.isfinite(q_place[..., 0])).any():
+            self.failures.record(0, PlanningFailureReason.UNREACHABLE, "the place")
+        if not self._is_held:
+            q_pick = self._robot.unwrap(q_pick, self._start)
+        return q_pick, self._robot.unwrap(q_place, q_pick)
 
     def _payload(
         self, grasp: Grasp, X_OG: RigidTransform, X_TG_pick: Floats, X_TG_place: Floats
@@ -194,11 +270,14 @@ class PickPlaceSearch:
         return replace(context, allowed_distances=of_gripper | of_object)
 
     def _place_endpoint(self, candidate: GraspCandidate, q: Floats) -> EndpointContext | None:
-        """Return the endpoint at the place pose, or None in collision."""
+        """Return the endpoint at the place pose, or None in collision.
+
+        Only an object that is released may touch its neighbors.
+        """
         self._segments.set_up_segment("carry", candidate)
         below = self._bodies_below(replace(self._picked, X_TO=self._X_TO_goal))
         of_gripper = self._segments.distances_below_object(candidate, q, below)
-        allowed = of_gripper | self._segments.contact_distances(q)
+        allowed = of_gripper | self._segments.contact_distances(q) if self._goal.releases else {}
         context = EndpointContext(candidate.tool, candidate.X_TG_place[:2, 3], allowed)
         distance = self._segments.min_distance_along(q[None], context, 2, "at the place")
         return None if distance is None else context
@@ -222,14 +301,14 @@ class PickPlaceSearch:
         x, y, z = (X_FG @ p_GCm).tolist()
         return replace(candidate.payload, p_FCm=(x, y, z))
 
-    def plan_candidate(self, candidate: GraspCandidate) -> PickPlacePlan | None:
-        """Return a plan with one of the `ik_candidates` at the lowest feasible height.
+    def plan_candidate(self, candidate: GraspCandidate) -> FoundMove | None:
+        """Return a motion with one of the `ik_candidates` at the lowest feasible height.
 
         Args:
             candidate: Grasp of the object.
 
         Returns:
-            The plan, or None after recording a failure.
+            The motion, or None after recording a failure.
         """
         self.num_attempts += 1
         candidate = replace(candidate, payload=self._load(candidate))
@@ -237,9 +316,9 @@ class PickPlaceSearch:
         if pick is None:
             return None
         # Without linear rows the configuration at the place pose results from the path.
-        place = None
+        place = pick if self._goal.X_TO_place is None else None
         ends_at_q_place = self._robot.vertical_tool_rows is not None or candidate.is_tilted
-        if ends_at_q_place:
+        if place is None and ends_at_q_place:
             place = self._place_endpoint(candidate, candidate.q_place)
             if place is None:
                 return None
@@ -252,43 +331,51 @@ class PickPlaceSearch:
         for bottom in self._transfer_heights:
             self.num_attempts += 1
             height = bottom + recess + gripper_height
-            carry_path = self._tools[candidate.tool].carry_path(
+            carry_path = self._carry_path(candidate, height)
+            if isinstance(carry_path, str):
+                self.failures.record(3, PlanningFailureReason.UNREACHABLE, carry_path, height)
+                return None
+            q_end = carry_path.reversed_lowering[0]
+            if place is None or (self._goal.X_TO_place and not ends_at_q_place):
+                place = self._place_endpoint(candidate, q_end)
+            if place is None:
+                continue
+            segments = self._segments.plan_segments(candidate, carry_path, (pick, place))
+            if segments is not None:
+                return self._make_move(candidate, segments, place, q_end)
+        return None
+
+    def _carry_path(self, candidate: GraspCandidate, height: float) -> CarryPath | str:
+        """Return the path with the object, or a description of the part that is out of reach."""
+        tool = self._tools[candidate.tool]
+        if self._goal.X_TO_place is not None:
+            return tool.carry_path(
                 candidate.X_TG_pick,
                 candidate.X_TG_place,
                 height,
                 candidate.q_pick,
                 candidate.q_place,
             )
-            if isinstance(carry_path, str):
-                self.failures.record(3, PlanningFailureReason.UNREACHABLE, carry_path, height)
-                return None
-            q_end = carry_path.reversed_lowering[0]
-            if not ends_at_q_place and (place := self._place_endpoint(candidate, q_end)) is None:
-                continue
-            assert place is not None
-            segments = self._segments.plan_segments(candidate, carry_path, (pick, place))
-            if segments is not None:
-                return self._make_plan(candidate, segments, place, q_end)
-        return None
+        lift = tool.lift_path(candidate.X_TG_pick, height, candidate.q_pick)
+        return "above the grasp" if lift is None else CarryPath(lift, lift[-1:], lift[-1:])
 
-    def _make_plan(
+    def _make_move(
         self,
         candidate: GraspCandidate,
-        segments: tuple[TrajectorySegment, ...],
+        segments: Mapping[str, TrajectorySegment],
         place: EndpointContext,
         q_place: Floats,
-    ) -> PickPlacePlan:
-        return PickPlacePlan(
-            pick=self._picked.name,
-            X_TO_pick=self._picked.X_TO,
-            X_TO_place=self._X_TO_goal,
-            tool=candidate.tool,
-            X_OG=candidate.X_OG,
-            joints_open=candidate.joints_open,
-            joints_held=candidate.joints_held,
-            payload=candidate.payload,
-            segments=segments,
-            num_attempts=self.num_attempts,
-            planning_time=0.0,
-            guarded_descent=self._segments.plan_guarded_descent(candidate, place, q_place),
+    ) -> FoundMove:
+        descent = None
+        if self._goal.releases:
+            descent = self._segments.plan_guarded_descent(candidate, place, q_place)
+        held = HeldObject(
+            self._picked.name,
+            candidate.tool,
+            candidate.X_OG,
+            candidate.payload,
+            candidate.insertion,
+            candidate.joints_open,
+            candidate.joints_held,
         )
+        return FoundMove(held, segments, descent)

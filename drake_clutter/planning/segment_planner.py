@@ -4,7 +4,7 @@ Frames: T is the support, G is a tool of the gripper, O is the picked object.
 """
 
 import math
-from collections.abc import Mapping, Set
+from collections.abc import Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -45,6 +45,7 @@ from drake_clutter.planning.trajectory_optimization import (
     TrajectoryOptimizationProblem,
     optimize_trajectory,
 )
+from drake_clutter.planning.transfer_planner import TransferPlanner
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.scene import Pose, SceneObject
 
@@ -63,6 +64,9 @@ INFLUENCE_DISTANCE = 0.06
 MAX_CARRY_TILT = math.radians(0.5)
 """Largest tilt of the gripper while it carries an object [rad]; the suction cup is planned for
 vertical loads."""
+MAX_TREE_SEARCHES = 3
+"""Largest number of searches of a move with RRT-Connect, which takes up to some seconds if it finds
+no path."""
 _DESCENT_STEP = 0.005
 """Distance between checked points of a guarded descent [m]."""
 
@@ -129,6 +133,9 @@ class SegmentPlanner:
         collision_model: CollisionModel,
         picked: SceneObject,
         X_TO_place: Pose,
+        start: Floats | None,
+        releases: bool,
+        end: Floats | None,
         failures: FailureLog,
     ) -> None:
         """Prepare the planner.
@@ -140,6 +147,9 @@ class SegmentPlanner:
             collision_model: Collision model with the objects at their poses.
             picked: Object to pick.
             X_TO_place: Pose at which the object is released.
+            start: Joint positions before the approach; None without approach. Shape (n,).
+            releases: Whether the object is released, and a retreat follows.
+            end: Joint positions after the retreat; None if it ends above the object. Shape (n,).
             failures: Log in which failures are recorded.
         """
         self._cell = cell
@@ -147,6 +157,10 @@ class SegmentPlanner:
         self._collision_model = collision_model
         self._picked = picked
         self._X_TO_place = X_TO_place
+        self._start = start
+        self._releases = releases
+        self._end = end
+        self._num_tree_searches = 0
         self._failures = failures
         self._tools = tools
         self._robot = load_robot(cell.robot)
@@ -247,8 +261,12 @@ class SegmentPlanner:
         candidate: GraspCandidate,
         carry_path: CarryPath,
         endpoints: tuple[EndpointContext, EndpointContext],
-    ) -> tuple[TrajectorySegment, ...] | None:
-        """Return approach, carry and retreat, or None after recording a failure."""
+    ) -> dict[str, TrajectorySegment] | None:
+        """Return `approach`, `carry` and `retreat` as far as asked for, by name.
+
+        Returns:
+            The segments, or None after recording a failure.
+        """
         empty = Payload()
         tool = self._tools[candidate.tool]
         # Without the object the tool leaves it upwards before it moves sideways.
@@ -257,15 +275,19 @@ class SegmentPlanner:
         if lift is None or lowering is None:
             self._failures.record(3, PlanningFailureReason.UNREACHABLE, "above the object")
             return None
-        paths_from_lift = tool.paths_home(lift[-1])
-        paths_from_lowering = tool.paths_home(lowering[-1])
         # Candidate waypoints and payload of each segment, in the order of planning.
-        candidates = {
-            "carry": ([carry_path.waypoints], candidate.payload),
-            "approach": ([np.vstack([lift, home[1:]])[::-1] for home in paths_from_lift], empty),
-            "retreat": ([np.vstack([lowering, home[1:]]) for home in paths_from_lowering], empty),
+        candidates: dict[str, tuple[Iterable[Floats], Payload]] = {
+            "carry": ([carry_path.waypoints], candidate.payload)
         }
-        segments = {}
+        if self._start is not None:
+            to_start = self._paths_between(tool, lift[-1], self._start)
+            approaches = (np.vstack([lift, path[1:]])[::-1] for path in to_start)
+            candidates["approach"] = (approaches, empty)
+        if self._releases:
+            q_end = lowering[-1] if self._end is None else self._end
+            to_end = self._paths_between(tool, lowering[-1], q_end)
+            candidates["retreat"] = ((np.vstack([lowering, path[1:]]) for path in to_end), empty)
+        segments = dict[str, TrajectorySegment]()
         for progress, (name, (paths, payload)) in enumerate(candidates.items(), start=4):
             attempts = (
                 self._plan_segment(name, waypoints, payload, candidate, endpoints, progress)
@@ -280,7 +302,23 @@ class SegmentPlanner:
                 name: self._optimize_segment(segments[name], payload, candidate, endpoints)
                 for name, (_, payload) in candidates.items()
             }
-        return segments["approach"], segments["carry"], segments["retreat"]
+        return segments
+
+    def _paths_between(self, tool: ToolKinematics, q: Floats, q_end: Floats) -> Iterator[Floats]:
+        """Yield candidate paths of an arm without an object. Shapes (m, n).
+
+        Between home and a grasp there are alternatives: other grasps and inverse kinematics
+        solutions. From and to any other configuration, RRT-Connect comes last.
+        """
+        if np.array_equal(q, q_end):
+            yield q_end[None]
+            return
+        yield from tool.paths_between(q, q_end)
+        if np.array_equal(q_end, self._robot.home) or self._num_tree_searches == MAX_TREE_SEARCHES:
+            return
+        self._num_tree_searches += 1
+        transfer = TransferPlanner(self._cell, self._config, tool, self._collision_model)
+        yield from transfer.tree_paths(q, q_end)
 
     def _plan_segment(
         self,

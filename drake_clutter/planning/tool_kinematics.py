@@ -223,7 +223,7 @@ class ToolKinematics:
         Returns:
             The path, or a description of the part that is out of reach.
         """
-        lift = self.track(_departure(X_pick, transfer_height), q_pick)
+        lift = self.lift_path(X_pick, transfer_height, q_pick)
         if lift is None:
             return "above the grasp"
         above_place = _departure(X_place, transfer_height)
@@ -259,22 +259,35 @@ class ToolKinematics:
         line = self.track(_vertical_line(X_TG, X_TG[2, 3] + distance), path[-1])
         return None if line is None else np.vstack([path, line[1:]])
 
-    def paths_home(self, q: Floats) -> list[Floats]:
-        """Return candidate paths to the home configuration. Shapes (m, n).
+    def lift_path(self, X_TG: Floats, height: float, q: Floats) -> Floats | None:
+        """Return the path from a grasp up to a height; a tilted tool first moves along its axis.
+
+        Args:
+            X_TG: Pose of the tool at the grasp. Shape (4, 4).
+            height: Height of G at the end [m].
+            q: Joint positions at the grasp. Shape (n,).
+
+        Returns:
+            Configurations, shape (m, n), or None out of reach.
+        """
+        return self.track(_departure(X_TG, height), q)
+
+    def paths_between(self, q: Floats, q_end: Floats) -> list[Floats]:
+        """Return candidate paths between two configurations. Shapes (m, n).
 
         The first is a straight line in joint space. The second first moves the gripper at its
-        height to the horizontal position that it has at home.
+        height to the horizontal position that it has at the end.
 
         Args:
             q: Joint positions at the start. Shape (n,).
+            q_end: Joint positions at the end. Shape (n,).
         """
-        home = self.robot.home
-        X_TG_home = self.pose(home)
+        X_TG_end = self.pose(q_end)
         X_TG = self.pose(q)
-        X_TG[:2, 3] = X_TG_home[:2, 3]
+        X_TG[:2, 3] = X_TG_end[:2, 3]
         q_retracted = self.robot.ik.follow(self._flange_pose(X_TG), q)
-        direct = linear_joint_path(q, home)
+        direct = linear_joint_path(q, q_end)
         if q_retracted is None:
             return [direct]
         retract = linear_joint_path(q, q_retracted)
-        return [direct, np.vstack([retract, linear_joint_path(q_retracted, home)[1:]])]
+        return [direct, np.vstack([retract, linear_joint_path(q_retracted, q_end)[1:]])]

@@ -3,7 +3,6 @@
 Sleeping bodies are standard in physics engines; Drake has none, so their free joints are locked.
 """
 
-import math
 from collections import deque
 from collections.abc import Sequence, Set
 from dataclasses import replace
@@ -13,13 +12,13 @@ from numpy.typing import NDArray
 from pydrake.geometry import CollisionFilterDeclaration, FilterId, GeometrySet
 from pydrake.systems.framework import Context
 
-from drake_clutter.planning.pick_place_plan import PickPlacePlan
+from drake_clutter.planning.motion_plan import Plan
 from drake_clutter.scenes.geometry import group_touching_objects, transport_pose
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.drake_judge import TOUCHING_MARGIN
 from drake_clutter.simulation.scene_plant import get_support_body
 from drake_clutter.station.clutter_station import ClutterStation
-from drake_clutter.station.command_schedule import DWELL_TIME, CommandSchedule
+from drake_clutter.station.command_schedule import CommandSchedule
 from drake_clutter.station.gripper_actuator import GraspStatus
 
 Floats = NDArray[np.float64]
@@ -30,8 +29,6 @@ steps of the simulation."""
 SLEEP_AFTER_DWELL = 0.15
 """Time after a dwell until which the neighbors stay awake [s]. Objects that still move stay awake
 longer."""
-_DESCENT_STEP = 0.01
-"""Height step at which contacts along a guarded descent are searched [m]."""
 
 
 def nearest_object(objects: Sequence[SceneObject], X_TO: Pose) -> SceneObject:
@@ -39,62 +36,76 @@ def nearest_object(objects: Sequence[SceneObject], X_TO: Pose) -> SceneObject:
     return min(objects, key=lambda o: float(np.linalg.norm(o.X_TO.p - X_TO.p)))
 
 
-def affected_bodies(
-    objects: Sequence[SceneObject], plan: PickPlacePlan
-) -> tuple[set[str], set[str]]:
-    """Return the names of the objects that a plan may disturb.
+def affected_bodies(objects: Sequence[SceneObject], plan: Plan) -> tuple[frozenset[str], ...]:
+    """Return the names of the objects that each step of a plan may disturb.
 
-    These are the stacks that touch the picked object at its pick pose or its place pose. Poses of
-    the plan may be estimates: the picked object is the one closest to the pick pose.
+    These are the stacks that touch the object that is grasped or released. Poses of the plan may be
+    estimates: the object is the one closest to its pose at the start of the plan.
 
     Args:
         objects: Objects at their actual poses.
         plan: Plan to execute.
 
     Returns:
-        Names of the objects affected by picking, and by placing. Both include the picked object.
+        Names for each step, which include the object; empty for steps that touch nothing.
     """
-    picked = nearest_object(objects, plan.X_TO_pick)
-    X_TO_place = transport_pose(plan.X_TO_pick, plan.X_TO_place, picked.X_TO)
-    num_heights = math.ceil(plan.max_descent / _DESCENT_STEP) + 1
-    placed = [
-        replace(picked, X_TO=X_TO_place.translated((0.0, 0.0, -height)))
-        for height in np.linspace(0.0, plan.max_descent, num_heights).tolist()
-    ]
+    start_poses = {o.name: o.X_TO for o in plan.start.objects}
+    actual = {
+        name: nearest_object(objects, start_poses[name])
+        for name in {step.object_name for step in plan.steps} - {""}
+    }
+    current = {o.name: o for o in objects}
+    affected = []
+    for step in plan.steps:
+        if not step.touched:
+            affected.append(frozenset[str]())
+            continue
+        moved = actual[step.object_name]
+        copies = [
+            replace(moved, X_TO=transport_pose(start_poses[step.object_name], X_TO, moved.X_TO))
+            for X_TO in step.touched
+        ]
+        affected.append(_names_near(copies, [*current.values()]))
+        current[moved.name] = copies[-1]
+    return tuple(affected)
+
+
+def _names_near(copies: Sequence[SceneObject], objects: Sequence[SceneObject]) -> frozenset[str]:
+    """Return the names of the stacks that an object touches at one of its poses.
+
+    Args:
+        copies: The object at these poses.
+        objects: All objects.
+    """
+    name = copies[0].name
+
+    def touches_copy(o: SceneObject) -> bool:
+        pairs = (group_touching_objects([copy, o], TOUCHING_MARGIN) for copy in copies)
+        return o.name != name and any(len(pair) == 1 for pair in pairs)
+
     groups = group_touching_objects(objects, TOUCHING_MARGIN)
-
-    def names_near(copies: Sequence[SceneObject]) -> set[str]:
-        def touches_copy(o: SceneObject) -> bool:
-            pairs = (group_touching_objects([copy, o], TOUCHING_MARGIN) for copy in copies)
-            return o is not picked and any(len(pair) == 1 for pair in pairs)
-
-        near = (o.name for group in groups if any(touches_copy(o) for o in group) for o in group)
-        return {picked.name, *near}
-
-    return names_near([picked]), names_near(placed)
+    near = (o.name for group in groups if any(touches_copy(o) for o in group) for o in group)
+    return frozenset({name, *near})
 
 
 def bodies_to_wake(
-    schedule: CommandSchedule, at_pick: Set[str], at_place: Set[str], time: float
-) -> set[str]:
+    schedule: CommandSchedule, affected: Sequence[Set[str]], time: float
+) -> frozenset[str]:
     """Return the names of the objects that must be awake at a time.
 
     Args:
         schedule: Command schedule of the plan.
-        at_pick: Names of the objects affected by picking, see `affected_bodies`.
-        at_place: Names of the objects affected by placing, see `affected_bodies`.
+        affected: Names of the objects affected by each step, see `affected_bodies`.
         time: Time since the start of the plan [s].
     """
-    pick_start = schedule.grasp_time - WAKE_BEFORE_CONTACT
-    pick_end = schedule.grasp_time + DWELL_TIME + SLEEP_AFTER_DWELL
-    place_start = schedule.descent_start_time - WAKE_BEFORE_CONTACT
-    place_end = schedule.release_time + DWELL_TIME + SLEEP_AFTER_DWELL
-    names = set[str]()
-    if pick_start <= time <= pick_end:
-        names |= at_pick
-    if place_start <= time <= place_end:
-        names |= at_place
-    return names
+    ends = (*schedule.starts[1:], schedule.end_time)
+    return frozenset().union(
+        *(
+            names
+            for names, start, end in zip(affected, schedule.starts, ends, strict=True)
+            if start - WAKE_BEFORE_CONTACT <= time <= end + SLEEP_AFTER_DWELL
+        )
+    )
 
 
 class BodySleepManager:

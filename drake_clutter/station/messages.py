@@ -10,6 +10,7 @@ from typing import Self
 import numpy as np
 
 from drake_clutter.cell.work_cell import default_cell
+from drake_clutter.planning.motion_plan import Plan
 from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
 from drake_clutter.scenes.interfaces import Move, Observation, PickPlaceCommand
 from drake_clutter.scenes.scene import SceneObject
@@ -68,7 +69,7 @@ class PlannedMove(Message):
         plan: Plan; None if `number` is 0.
     """
 
-    plan: PickPlacePlan | None = field(default=None, repr=False)
+    plan: Plan | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from pydrake.systems.framework import (
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.arm_dynamics import arm_dynamics
+from drake_clutter.planning.motion_plan import Plan
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.station.command_schedule import CommandSchedule, build_command_schedule
@@ -50,7 +51,7 @@ class ExecutorState(Message):
             without contact.
     """
 
-    plan: PickPlacePlan | None = None
+    plan: Plan | None = None
     schedule: CommandSchedule | None = None
     start_time: float = 0.0
     bellows_extension: float = math.nan
@@ -59,7 +60,7 @@ class ExecutorState(Message):
     @property
     def lowered_distance(self) -> float:
         """Distance between the planned and the actual release height [m]."""
-        if self.plan is None or self.plan.guarded_descent is None:
+        if not isinstance(self.plan, PickPlacePlan) or self.plan.guarded_descent is None:
             return 0.0
         return self.plan.guarded_descent.depth_at(self.contact_time)
 
@@ -185,13 +186,19 @@ class PickPlaceExecutor(LeafSystem):
     def _detect_contact(self, context: Context, state: ExecutorState) -> ExecutorState:
         """Return the state, updated if contact occurs during a guarded descent."""
         schedule = state.schedule
-        if schedule is None or state.plan is None or not self._gripper_state.HasValue(context):
+        if (
+            schedule is None
+            or not isinstance(state.plan, PickPlacePlan)
+            or state.plan.guarded_descent is None
+            or not self._gripper_state.HasValue(context)
+        ):
             return state
         joint = self._tools[state.plan.tool].compliant_joint
         if joint is None:
             return state
-        descent_duration = schedule.release_time - schedule.descent_start_time
-        descent_time = context.get_time() - state.start_time - schedule.descent_start_time
+        descent_start = schedule.start_of("descend")
+        descent_duration = schedule.release_time - descent_start
+        descent_time = context.get_time() - state.start_time - descent_start
         is_descending = 0 < descent_time < descent_duration
         if not is_descending or math.isfinite(state.contact_time):
             return state
@@ -225,10 +232,8 @@ class PickPlaceExecutor(LeafSystem):
     def _calc_hold(self, context: Context, output: BasicVector) -> None:
         state = self.state(context)
         held = ""
-        if state.schedule is not None and state.plan is not None:
-            time = state.elapsed(context.get_time())
-            if state.schedule.grasp_time <= time < state.schedule.release_time:
-                held = state.plan.tool
+        if state.schedule is not None:
+            held = state.schedule.tool_at(state.elapsed(context.get_time()))
         output.SetFromVector([float(name == held) for name in self._tools])
 
     def _calc_finished(self, context: Context, output: BasicVector) -> None:

@@ -13,10 +13,13 @@ from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.files import InputError, format_value
+from drake_clutter.planning.motion_plan import Plan
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.scenes.interfaces import MotionSample
 from drake_clutter.scenes.scene import Pose, Scene, tilt_between
@@ -49,6 +52,8 @@ _TIME_MARGIN = 0.001
 """Time by which the simulator advances beyond a step [s], so that rounding does not decide which
 update of the plant belongs to it; less than a time step."""
 _GRIPPER_UPDATES_PER_STEP = round(STEP_PERIOD / GRIPPER_UPDATE_PERIOD)
+MAX_START_ERROR = 1e-4
+"""Largest difference between the commanded joints and the start of a plan [rad]."""
 POST_MOTION_WAIT = 1.0
 """Time after the end of a plan in which fallen objects stay awake [s]."""
 
@@ -208,8 +213,7 @@ class StationSimulation:
         self._sleep.reset(self.root)
         self._num_steps = 0
         self._affected_plan = 0
-        self._affected_at_pick = set[str]()
-        self._affected_at_place = set[str]()
+        self._affected: tuple[frozenset[str], ...] = ()
 
     def release(self) -> None:
         """Free the memory of the diagram; the simulation cannot be used afterwards.
@@ -262,18 +266,14 @@ class StationSimulation:
     def step(self) -> None:
         """Advance by `STEP_PERIOD`."""
         state = self.executor_state
-        required = set[str]()
+        required = frozenset[str]()
         expects_grasp = False
         if state.plan is not None and state.schedule is not None:
             if state.number != self._affected_plan:
                 self._affected_plan = state.number
-                self._affected_at_pick, self._affected_at_place = affected_bodies(
-                    self.scene.objects, state.plan
-                )
+                self._affected = affected_bodies(self.scene.objects, state.plan)
             elapsed = self.root.get_time() - state.start_time
-            required = bodies_to_wake(
-                state.schedule, self._affected_at_pick, self._affected_at_place, elapsed
-            )
+            required = bodies_to_wake(state.schedule, self._affected, elapsed)
             end = state.schedule.end_time + POST_MOTION_WAIT
             expects_grasp = state.schedule.grasp_time + STEP_PERIOD <= elapsed < end
         self._sleep.update(self.root, required, self.gripper.status, expects_grasp=expects_grasp)
@@ -299,15 +299,19 @@ class StationSimulation:
         """Return X_TO of all objects, by name."""
         return {o.name: o.X_TO for o in self.scene.objects}
 
-    def execute(self, plan: PickPlacePlan, *, record: bool = False) -> PickPlaceResult:
-        """Execute a plan until the arm is home, and for `SETTLE_TIME` more.
+    def execute(self, plan: Plan, *, record: bool = False) -> PickPlaceResult:
+        """Execute a plan until its end, and for `SETTLE_TIME` more.
 
         The diagram must not have been built with `add_systems` that connect the executor.
 
         Args:
             plan: Plan to execute.
             record: Whether to record a sample per step.
+
+        Raises:
+            InputError: The plan does not start at the commanded joint positions.
         """
+        self._check_start(plan)
         before = self.scene
         number = self.executor_state.number + 1
         context = self.executor.GetMyMutableContextFromRoot(self.root)
@@ -330,29 +334,45 @@ class StationSimulation:
                 motion.append(self.sample())
         return self._result(plan, before, max_tracking_error, tuple(motion))
 
+    def _check_start(self, plan: Plan) -> None:
+        """Raise an error unless a plan starts at the commanded joint positions."""
+        commanded = self._commanded_positions()
+        start = np.array(plan.start.q)
+        if start.shape != commanded.shape or np.abs(start - commanded).max() > MAX_START_ERROR:
+            raise InputError(
+                f"plan: starts at joints {format_value(start.round(4).tolist())}; expected those "
+                f"of the arm, {format_value(commanded.round(4).tolist())}"
+            )
+
     def _result(
         self,
-        plan: PickPlacePlan,
+        plan: Plan,
         before: Scene,
         max_tracking_error: float,
         motion: tuple[MotionSample, ...],
     ) -> PickPlaceResult:
         poses = self._poses()
         status = self.gripper.status
-        object_class = self.station.object_classes[plan.pick]
-        X_TO = poses[plan.pick]
+        held = {state.held.name for state in (plan.start, plan.end) if state.held}
+        names = {step.object_name for step in plan.steps if step.object_name} | held
+        moved = [o for o in plan.end.objects if o.name in names]
         return PickPlaceResult(
             poses=poses,
             grasped=status.has_held,
             drop_time=status.release_time,
             max_load_ratio=status.max_load_ratio,
             slip=status.slip,
-            position_error=float(np.linalg.norm((X_TO.p - plan.X_TO_place.p)[:2])),
-            orientation_error=tilt_between(object_class, plan.X_TO_place, X_TO),
+            position_error=max(
+                (float(np.linalg.norm((poses[o.name].p - o.X_TO.p)[:2])) for o in moved),
+                default=0.0,
+            ),
+            orientation_error=max(
+                (tilt_between(o.object_class, o.X_TO, poses[o.name]) for o in moved), default=0.0
+            ),
             displacements={
                 o.name: float(np.linalg.norm(poses[o.name].p - o.X_TO.p))
                 for o in before.objects
-                if o.name != plan.pick
+                if o.name not in names
             },
             lowered_distance=self.executor_state.lowered_distance,
             max_tracking_error=max_tracking_error,
@@ -361,10 +381,14 @@ class StationSimulation:
         )
 
     def _tracking_error(self) -> float:
-        command = self.executor.GetOutputPort("command")
         q = self.station.joint_positions(self.plant_context)
-        q_desired = command.Eval(self.executor.GetMyContextFromRoot(self.root))[: len(q)]
-        return float(np.abs(q_desired - q).max())
+        return float(np.abs(self._commanded_positions() - q).max())
+
+    def _commanded_positions(self) -> NDArray[np.float64]:
+        """Return the commanded joint positions of the arm [rad]. Shape (n,)."""
+        command = self.executor.GetOutputPort("command")
+        values = command.Eval(self.executor.GetMyContextFromRoot(self.root))
+        return np.asarray(values[: len(values) // 3])
 
     def _commanded_tool(self, root: Context) -> str:
         """Return the name of the tool that is commanded to hold an object; "" for none."""
@@ -395,7 +419,7 @@ def simulate_plan(
         plan: Plan to execute.
         record: Whether to record a sample per step.
     """
-    affected = set.union(*affected_bodies(scene.objects, plan))
+    affected = frozenset[str]().union(*affected_bodies(scene.objects, plan))
     coarse = StationSimulation(cell, scene, movable=affected, time_step=COARSE_TIME_STEP)
     result = coarse.execute(plan, record=record)
     is_accepted = result.is_uneventful and not coarse.woken_fixed_objects
