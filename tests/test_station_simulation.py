@@ -57,14 +57,14 @@ def planned(cell: WorkCell = CELL) -> PickPlacePlan:
 
 
 def link_poses(simulation: StationSimulation) -> dict[str, Pose]:
-    """Return X_TL of the arm's links by name, without cups, which move on their bellows."""
+    """Return X_TL of the arm's links by name, without the links of cups with moving bellows."""
     plant, context = simulation.station.plant, simulation.plant_context
     return {
         f"{plant.GetModelInstanceName(body.model_instance())}::{body.name()}": pose_from_transform(
             body.EvalPoseInWorld(context)
         )
         for body in simulation.station.arm.bodies
-        if not body.name().endswith("_cup")
+        if not body.name().endswith(("_slide", "_gimbal", "_cup"))
     }
 
 

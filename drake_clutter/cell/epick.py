@@ -12,7 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_clutter.cell.primitives import LinkPrimitive, Point, sdf_link, sdf_pose
+from drake_clutter.cell.primitives import (
+    LinkPrimitive,
+    Point,
+    sdf_inertial,
+    sdf_link,
+    sdf_pose,
+)
 from drake_clutter.cell.suction_cup import SuctionCup
 
 Floats = NDArray[np.float64]
@@ -39,22 +45,18 @@ def epick_sdf(cups: Sequence[SuctionCup], *, compliant: bool) -> str:
 
     Args:
         cups: Cups; a bar connects the tube of each with the end of the body.
-        compliant: Whether the cups can move along their bellows; else they are fixed to the body.
+        compliant: Whether the bellows of the cups can give and bend; else the cups are fixed to the
+            body.
     """
     parts, masses, centers = _rigid_parts(cups)
     mass = sum(masses)
     p_FCm = np.array(masses) @ np.array(centers) / mass
     links = [sdf_link("body", "", mass, p_FCm, parts, parts, "cylinder")]
+    joints = list[str]()
     for cup in cups:
-        X_FG = cup.X_FG.transform
-        rotation = Rotation.from_matrix(X_FG.rotation().matrix())
-        pose = "\n      " + sdf_pose(X_FG.translation(), rotation, "body")
-        bellows = LinkPrimitive(
-            (0.0, 0.0, -cup.length), (0.0, 0.0, 0.0), cup.diameter / 2, _RUBBER_COLOR
-        )
-        p_GCm = np.array([0.0, 0.0, -cup.length / 2])
-        links.append(sdf_link(cup.link, pose, cup.mass, p_GCm, (bellows,), (bellows,), "cylinder"))
-    joints = [_bellows_joint(cup, compliant=compliant) for cup in cups]
+        parts_of_cup = _moving_cup(cup) if compliant else _fixed_cup(cup)
+        links += parts_of_cup[0]
+        joints += parts_of_cup[1]
     return f"""<?xml version="1.0"?>
 <!-- Written by drake_clutter.cell.epick, which names the sources. -->
 <sdf version="1.10">
@@ -98,15 +100,70 @@ def _point(p: Floats) -> Point:
     return x, y, z
 
 
-def _bellows_joint(cup: SuctionCup, *, compliant: bool) -> str:
-    axis = f"""
-      <axis>
-        <xyz>0 0 1</xyz>
-        <limit><lower>{-cup.stroke:g}</lower><upper>{cup.stroke:g}</upper><effort>0</effort></limit>
-        <dynamics><damping>{cup.damping:.6g}</damping><spring_stiffness>{cup.stiffness:g}</spring_stiffness></dynamics>
-      </axis>"""
+def _fixed_cup(cup: SuctionCup) -> tuple[list[str], list[str]]:
+    """Return links and joints of a cup that is fixed to the body."""
+    return [_cup_link(cup, cup.link, cup.mass)], [_joint(cup.bellows, "fixed", "body", cup.link)]
+
+
+def _moving_cup(cup: SuctionCup) -> tuple[list[str], list[str]]:
+    """Return links and joints of a cup whose bellows give along their axis and bend.
+
+    The mass is shared equally: every link between the joints needs an inertia.
+    """
+    slide, gimbal = f"{cup.name}_slide", f"{cup.name}_gimbal"
+    links = [
+        _cup_link(cup, slide, cup.link_mass, has_shape=False),
+        _cup_link(cup, gimbal, cup.link_mass, has_shape=False),
+        _cup_link(cup, cup.link, cup.link_mass),
+    ]
+    about_x, about_y = cup.bending_joints
+    limit = f"<lower>{-cup.stroke:g}</lower><upper>{cup.stroke:g}</upper>"
+    bending = (cup.bending_stiffness, cup.bending_damping)
+    hinge = f"<pose>0 0 {-cup.hinge_distance:.12g} 0 0 0</pose>"
+    return links, [
+        _joint(
+            cup.bellows,
+            "prismatic",
+            "body",
+            slide,
+            _axis("0 0 1", limit, cup.stiffness, cup.damping),
+        ),
+        _joint(about_x, "revolute", slide, gimbal, hinge + _axis("1 0 0", "", *bending)),
+        _joint(about_y, "revolute", gimbal, cup.link, hinge + _axis("0 1 0", "", *bending)),
+    ]
+
+
+def _cup_link(cup: SuctionCup, name: str, mass: float, *, has_shape: bool = True) -> str:
+    """Return a link of a cup with frame G."""
+    X_FG = cup.X_FG.transform
+    rotation = Rotation.from_matrix(X_FG.rotation().matrix())
+    pose = "\n      " + sdf_pose(X_FG.translation(), rotation, "body")
+    bellows = LinkPrimitive(
+        (0.0, 0.0, -cup.length), (0.0, 0.0, 0.0), cup.diameter / 2, _RUBBER_COLOR
+    )
+    p_GCm = np.array([0.0, 0.0, -cup.length / 2])
+    if has_shape:
+        return sdf_link(name, pose, mass, p_GCm, (bellows,), (bellows,), "cylinder")
     return f"""
-    <joint name="{cup.bellows}" type="{"prismatic" if compliant else "fixed"}">
-      <parent>body</parent>
-      <child>{cup.link}</child>{axis if compliant else ""}
+    <link name="{name}">{pose}{sdf_inertial(mass, p_GCm, bellows)}
+    </link>"""
+
+
+def _axis(direction: str, limit: str, stiffness: float, damping: float) -> str:
+    """Return an SDF axis element of a joint with a spring."""
+    dynamics = f"<damping>{damping:.6g}</damping><spring_stiffness>{stiffness:g}</spring_stiffness>"
+    return f"""
+      <axis>
+        <xyz>{direction}</xyz>
+        <limit>{limit}<effort>0</effort></limit>
+        <dynamics>{dynamics}</dynamics>
+      </axis>"""
+
+
+def _joint(name: str, kind: str, parent: str, child: str, elements: str = "") -> str:
+    """Return an SDF joint element."""
+    return f"""
+    <joint name="{name}" type="{kind}">
+      <parent>{parent}</parent>
+      <child>{child}</child>{elements}
     </joint>"""

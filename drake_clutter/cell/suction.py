@@ -106,7 +106,7 @@ class SuctionGripper(StrictModel):
     def tools(self) -> Mapping[str, Tool]:
         """Cups by name."""
         return {
-            cup.name: Tool(cup.name, cup.link, cup.X_FG.transform, (cup.link,), k)
+            cup.name: Tool(cup.name, cup.link, cup.X_FG.transform, (cup.link,), k * len(cup.joints))
             for k, cup in enumerate(self.cups)
         }
 
@@ -124,8 +124,8 @@ class SuctionGripper(StrictModel):
 
     @property
     def num_joints(self) -> int:
-        """Bellows of each cup."""
-        return len(self.cups)
+        """Extension of the bellows and two angles of bending, of each cup."""
+        return sum(len(cup.joints) for cup in self.cups)
 
     @property
     def num_actuated_joints(self) -> int:

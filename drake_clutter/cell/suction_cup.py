@@ -24,6 +24,13 @@ _REFERENCE_LOAD = 0.5
 """Load of a cup of that diameter for which the damping ratio holds [kg]; about a sugar box."""
 _DAMPING_RATIO = 2.0
 """Damping ratio of the bellows with the reference load: overdamped, as rubber is."""
+_BENDING_DAMPING_RATIO = 0.3
+"""Damping ratio of the bending bellows with the reference load at `_REFERENCE_DISTANCE`: rubber and
+the friction between folds; an assumption."""
+_REFERENCE_DISTANCE = 0.1
+"""Distance of the reference load from the bellows [m]."""
+_NUM_MOVING_LINKS = 3
+"""Links that share the mass of a cup whose bellows move: they slide, bend about x, and about y."""
 _TUBE_MASS_PER_VOLUME = 0.05 / (0.100 * 0.010**2)
 """Mass of a tube divided by length and squared radius [kg/m^3]; assumed, 50 g for a tube of 100 mm
 length and 10 mm radius."""
@@ -41,6 +48,7 @@ class SuctionCup(StrictModel):
         tube_radius: Radius of the tube [m].
         stroke: Largest compression, and largest extension, of the bellows [m].
         stiffness: Axial stiffness of the bellows [N/m].
+        bending_stiffness: Stiffness of the evacuated bellows against tilt of the lip [N m/rad].
     """
 
     name: Annotated[str, Field(strict=True, pattern=r"^[A-Za-z]\w*$")]
@@ -51,6 +59,7 @@ class SuctionCup(StrictModel):
     tube_radius: Annotated[float, InRange(0.001, 0.05)] = 0.010
     stroke: Annotated[float, InRange(0.001, 0.05)] = 0.006
     stiffness: Annotated[float, InRange(100.0, 1e5)] = 2_000.0
+    bending_stiffness: Annotated[float, InRange(1e-3, 1e3)] = 4.9
 
     @property
     def link(self) -> str:
@@ -59,13 +68,33 @@ class SuctionCup(StrictModel):
 
     @property
     def bellows(self) -> str:
-        """Joint of the SDF model between body and cup."""
+        """Joint of the SDF model along which the bellows give."""
         return f"{self.name}_bellows"
+
+    @property
+    def bending_joints(self) -> tuple[str, str]:
+        """Joints of the SDF model about x and y of G; the lip is the child of the second."""
+        return f"{self.name}_bend_x", f"{self.name}_bend_y"
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Joints of the SDF model between body and lip, in the order of the model."""
+        return self.bellows, *self.bending_joints
+
+    @property
+    def hinge_distance(self) -> float:
+        """Distance of the axes of bending, in the middle of the bellows, from the lip [m]."""
+        return self.length / 2
 
     @property
     def mass(self) -> float:
         """Mass of the cup [kg], proportional to the area of the lip."""
         return _REFERENCE_CUP_MASS * self._relative_area
+
+    @property
+    def link_mass(self) -> float:
+        """Mass of each link of a cup whose bellows move [kg]."""
+        return self.mass / _NUM_MOVING_LINKS
 
     @property
     def tube_mass(self) -> float:
@@ -77,6 +106,12 @@ class SuctionCup(StrictModel):
         """Damping of the bellows [N s/m]; overdamped for loads that the cup may hold."""
         reference_load = _REFERENCE_LOAD * self._relative_area
         return _DAMPING_RATIO * 2 * math.sqrt(self.stiffness * reference_load)
+
+    @property
+    def bending_damping(self) -> float:
+        """Damping of the bending bellows [N m s/rad]."""
+        inertia = _REFERENCE_LOAD * self._relative_area * _REFERENCE_DISTANCE**2
+        return 2 * _BENDING_DAMPING_RATIO * math.sqrt(self.bending_stiffness * inertia)
 
     @property
     def _relative_area(self) -> float:

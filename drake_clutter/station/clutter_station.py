@@ -69,8 +69,8 @@ class ClutterStation(Diagram):
     Output ports:
         state: State of the plant. Shape (num_multibody_states,).
         body_poses: Poses of all bodies of the plant in the world, a list of `RigidTransform`.
-        gripper_state: Positions [m], then velocities [m/s] of the gripper's k joints, such as the
-            extensions of the bellows in the order of the cups. Shape (2 k,).
+        gripper_state: Positions, then velocities of the gripper's k joints: of each suction cup the
+            extension of the bellows [m, m/s] and two angles of bending [rad, rad/s]. Shape (2 k,).
         query: `QueryObject` of `camera_scene_graph`. Only with visuals.
 
     Attributes:

@@ -84,13 +84,20 @@ class _CupLoad:
         self._cups = {cup.name: cup for cup in gripper.cups}
 
     def calc(self, context: Context, tool: str) -> tuple[Floats, Floats]:
-        """Return force and moment in the joint of the bellows without the cup's weight, in G."""
+        """Return force and moment about the lip in the last joint without the lip's weight, in G.
+
+        The inertia of the lip's link is neglected.
+        """
         cup = self._cups[tool]
-        bellows = self._plant.GetJointByName(cup.bellows, self._arm.gripper)
-        reaction = self._plant.get_reaction_forces_output_port().Eval(context)[bellows.index()]
+        joint = self._plant.GetJointByName(cup.joints[-1], self._arm.gripper)
+        reaction = self._plant.get_reaction_forces_output_port().Eval(context)[joint.index()]
         down_G = -self._arm.tools[tool].CalcPoseInWorld(context).rotation().matrix()[2]
-        weight = GRAVITY * cup.mass * down_G
-        return -np.asarray(reaction.translational() + weight), -np.asarray(reaction.rotational())
+        weight = GRAVITY * cup.link_mass * down_G
+        p_GHinge = np.array([0.0, 0.0, -cup.hinge_distance])
+        p_GCm = np.array([0.0, 0.0, -cup.length / 2])
+        force = reaction.translational()
+        moment = reaction.rotational() + np.cross(p_GHinge, force) + np.cross(p_GCm, weight)
+        return -np.asarray(force + weight), -np.asarray(moment)
 
 
 class WeldGrasp:

@@ -102,7 +102,7 @@ class PickPlaceExecutor(LeafSystem):
 
     Input ports:
         plan: `PlannedMove`. A plan with a new number starts as soon as the previous one has ended.
-        gripper_state: Positions [m], then velocities [m/s] of the gripper's k joints. A guarded
+        gripper_state: Positions, then velocities of the gripper's k joints. A guarded
             descent ends when the bellows of the tool are compressed, or at its planned end. Shape
             (2 k,).
 

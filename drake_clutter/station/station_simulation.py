@@ -43,7 +43,7 @@ TIME_STEP = STEP_PERIOD / 10
 """Time step of the plant [s]. With twice as much, high stacks creep and fall."""
 COARSE_TIME_STEP = 2 * TIME_STEP
 """Time step of moves in which nothing unexpected happens [s], see `simulate_plan`."""
-MAX_COARSE_DISPLACEMENT = 0.001
+MAX_COARSE_DISPLACEMENT = 0.002
 """Largest error of the final position, and largest displacement of another object, of a move that
 counts as uneventful [m]."""
 MAX_COARSE_TILT = math.radians(1)
