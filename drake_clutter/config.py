@@ -92,6 +92,30 @@ class SettleConfig:
 
 
 @config_class
+class PlacementConfig:
+    """What is not known of the objects that are to carry another one.
+
+    Attributes:
+        position_doubt: Bound on the error of an object's horizontal position [m].
+        size_doubt: Bound on the error of an object's horizontal extents [m].
+        max_offset_fraction: Largest offset of the placed object's center of mass from that of its
+            carrier, as a fraction of the distance from there to the edge of the carrier's top.
+        hidden_support_fraction: Part of an object's bottom, about its center of mass, on which it
+            is known to rest if what carries it is hidden.
+    """
+
+    position_doubt: NonNegative = 0.002
+    size_doubt: NonNegative = 0.001
+    max_offset_fraction: Annotated[float, InRange(0.0, 1.0)] = 0.5
+    hidden_support_fraction: Annotated[float, InRange(0.0, 1.0)] = 0.1
+
+    @property
+    def contact_margin(self) -> float:
+        """Width by which the contact of two objects may be smaller than it seems [m]."""
+        return 2 * self.position_doubt + self.size_doubt
+
+
+@config_class
 class ExplorationConfig:
     """Moves, rewards and placements of the exploration task.
 
@@ -102,6 +126,7 @@ class ExplorationConfig:
         clearance: Distance kept between a placed object's footprint and anything else that the
             camera sees [m].
         release_height: Height above its support at which an object is released [m].
+        placement: What is not known of the objects that are to carry another one.
     """
 
     max_moves: Count = 10
@@ -109,6 +134,7 @@ class ExplorationConfig:
     collapse_penalty: Annotated[float, InRange(-1e300, 0.0)] = -1.0
     clearance: NonNegative = 0.010
     release_height: NonNegative = 0.001
+    placement: PlacementConfig = field(default_factory=PlacementConfig)
 
 
 @config_class

@@ -27,8 +27,9 @@ from drake_clutter.perception.pose_selection import evaluate_pose
 from drake_clutter.perception.segmentation import ImageWindow
 from drake_clutter.reports.detection_image import IMAGE_SIDE, draw_detections
 from drake_clutter.resources import resource_path
+from drake_clutter.scenes.free_space import is_observed_free
 from drake_clutter.scenes.occlusion import occluded_boxes
-from drake_clutter.scenes.placement import has_clear_top, is_observed_free
+from drake_clutter.scenes.placement import has_clear_top
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.simulation.camera_renderer import CameraRenderer
 from drake_clutter.stability.ray_caster import RayCaster

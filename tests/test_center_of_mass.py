@@ -18,8 +18,9 @@ from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.scenes.free_space import CELL_SIZE
 from drake_clutter.scenes.interfaces import Move
-from drake_clutter.scenes.placement import CELL_SIZE, find_free_placements
+from drake_clutter.scenes.placement import find_free_placements
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.settle import settle
 from drake_clutter.stability.static_judge import StaticStabilityJudge

@@ -252,7 +252,8 @@ def test_states_are_equal_within_a_millimeter() -> None:
 
 
 def test_no_plan_starts_with_an_invalid_move() -> None:
-    scene = scene_of(*covered(), IN_VIEW)
+    can = resting("tomato_soup_can", xy=(0.2, 0.2), name="in view")
+    scene = scene_of(*covered(), can)
     (first,) = SEARCH.solve(scene).plan
     (other,) = SEARCH.solve(scene, invalid_moves=[first]).plan
     assert (first.pick, other.pick) == ("cover", "cover")

@@ -8,17 +8,15 @@ from conftest import CLASSES, DEFAULT_CELL, random_scene, resting, rng, scene_of
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_clutter.config import ExplorationConfig
+from drake_clutter.config import ExplorationConfig, PlacementConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.scenes.free_space import CELL_SIZE, is_observed_free, next_free_cell
 from drake_clutter.scenes.geometry import penetration_depth
 from drake_clutter.scenes.interfaces import Move, Observation
 from drake_clutter.scenes.placement import (
-    CELL_SIZE,
-    _first_free_cells,
     find_free_placements,
     has_clear_top,
-    is_observed_free,
     resolve_placement,
     top_height,
 )
@@ -34,13 +32,23 @@ def seen(detector: LabelDetector, scene: Scene) -> Observation:
 
 
 def placement(
-    detector: LabelDetector, scene: Scene, pick: str, place: str = TRAY, seed: int = 0
+    detector: LabelDetector,
+    scene: Scene,
+    pick: str,
+    place: str = TRAY,
+    seed: int = 0,
+    config: ExplorationConfig = CONFIG,
 ) -> Pose | None:
-    return placed_at(seen(detector, scene), Move(pick, place), rng(seed))
+    return placed_at(seen(detector, scene), Move(pick, place), rng(seed), config)
 
 
-def placed_at(observation: Observation, move: Move, generator: np.random.Generator) -> Pose | None:
-    command = resolve_placement(move, observation, CONFIG, generator)
+def placed_at(
+    observation: Observation,
+    move: Move,
+    generator: np.random.Generator,
+    config: ExplorationConfig = CONFIG,
+) -> Pose | None:
+    command = resolve_placement(move, observation, config, generator)
     return command.X_TO_place if command else None
 
 
@@ -67,17 +75,15 @@ def deepest_with(scene: Scene, name: str, X_TO: Pose, besides: Sequence[str] = (
     )
 
 
-def test_on_an_empty_tray_the_object_goes_to_the_edge(detector: LabelDetector) -> None:
-    """A box of 175 mm x 89 mm on 700 mm keeps 10 mm from the rim, up to a cell.
-
-    It is placed along y, where its center can be farther out.
-    """
+def test_on_an_empty_tray_the_object_goes_into_a_corner(detector: LabelDetector) -> None:
+    """A box of 175 mm x 89 mm on 700 mm keeps 10 mm from two rims, up to a cell."""
     box = resting("sugar_box", name="box")
     X_TO = placement(detector, scene_of(box), "box")
     assert X_TO is not None
     furthest = 0.350 - 0.010 - 0.089 / 2  # of the center, along y
     assert furthest - 1.5 * CELL_SIZE <= abs(X_TO.p[1]) <= furthest
-    assert abs(X_TO.p[0]) <= 0.350 - 0.010 - 0.175 / 2
+    furthest = 0.350 - 0.010 - 0.175 / 2  # of the center, along x
+    assert furthest - 1.5 * CELL_SIZE <= abs(X_TO.p[0]) <= furthest
     assert X_TO.rotation == pytest.approx(box.X_TO.rotation)
     assert X_TO.p[2] == pytest.approx(box.X_TO.p[2] + CONFIG.release_height)
 
@@ -185,11 +191,13 @@ def test_beside_what_stands_on_the_top(detector: LabelDetector) -> None:
         *(BELOW, resting("tomato_soup_can", xy=(0.05, 0.05), floor=0.060, name="can")),
         resting("gelatin_box", xy=(-0.2, -0.2), name="picked"),
     )
-    X_TO = placement(detector, scene, "picked", "below")
+    assert placement(detector, scene, "picked", "below") is None  # too far from the middle
+    anywhere = ExplorationConfig(placement=PlacementConfig(max_offset_fraction=1.0))
+    X_TO = placement(detector, scene, "picked", "below", config=anywhere)
     assert X_TO is not None
     assert deepest_with(scene, "picked", X_TO, ["below"]) <= -CONFIG.clearance
     aside = np.abs(X_TO.p[:2] - 0.05)
-    assert 0.033 + 0.010 + 0.0425 <= aside[0] <= 0.115 - 0.005
+    assert 0.033 + 0.010 + 0.0365 <= aside[0] <= 0.115 - 0.005
     assert aside[1] <= 0.080 - 0.005
 
 
@@ -223,6 +231,39 @@ def test_a_quarter_turn_if_only_that_fits(detector: LabelDetector) -> None:
     without_walls = placement(detector, scene_of(box), "picked")
     assert without_walls is not None
     assert without_walls.rotation == pytest.approx(box.X_TO.rotation)
+
+
+def test_an_eighth_of_a_turn_if_only_that_fits(detector: LabelDetector) -> None:
+    """On a tray of 270 mm, 10 mm from the rim, a box of 262 mm x 72 mm fits only across.
+
+    At 45 degrees it is (262 + 72) / sqrt(2) = 236 mm wide; at 30 degrees, 263 mm.
+    """
+    box = resting("pasta_box", xy=(0.0, 0.26), name="picked")  # beside the tray
+    X_TO = placement(detector, scene_of(box, side=0.27), "picked")
+    assert X_TO is not None
+    placed = SceneObject("picked", box.object_class, X_TO)
+    assert (placed.bounds_T[1] - placed.bounds_T[0])[:2] == pytest.approx([0.2362] * 2, abs=1e-4)
+    assert np.abs(placed.bounds_T)[:, :2].max() <= 0.135 - CONFIG.clearance
+
+
+def test_objects_are_packed_side_by_side(detector: LabelDetector) -> None:
+    """The second of two boxes goes beside the first, into the same or another corner."""
+    first = resting("sugar_box", xy=(-0.2475, -0.29), name="first")
+    scene = scene_of(first, resting("sugar_box", xy=(0.0, 0.0), name="picked"), side=0.70)
+    for seed in range(5):
+        X_TO = placement(detector, scene, "picked", seed=seed)
+        assert X_TO is not None
+        bounds = np.array(SceneObject("picked", first.object_class, X_TO).bounds_T)
+        gaps = 0.350 - np.abs(bounds[:, :2]).max(axis=0)
+        assert gaps.max() <= 0.010 + 1.5 * CELL_SIZE
+
+
+def test_nothing_is_put_on_a_lying_cylinder(detector: LabelDetector) -> None:
+    """Its top is a line; a can that stands upright carries a gelatin box."""
+    picked = resting("gelatin_box", xy=(-0.2, -0.2), name="picked")
+    for name, carries in (("tomato_soup_can", True), ("large_marker", False)):
+        scene = scene_of(resting(name, name="below"), picked)
+        assert (placement(detector, scene, "picked", "below") is not None) == carries
 
 
 @pytest.mark.parametrize(
@@ -316,5 +357,6 @@ def test_only_points_in_the_image_are_seen_to_be_free() -> None:
     cell = np.zeros((1, 2), np.int64)
     for (x, y, z), is_in_image in zip(p_T.tolist(), expected, strict=True):
         grid = (np.array([x]), np.array([y]), np.array([z]))
-        found = _first_free_cells(depth, camera.pinhole, *grid, cell, cell, np.zeros(1))
-        assert found.tolist() == [0] * is_in_image
+        rows, state = np.zeros((1, 3), np.int64), np.zeros((1, 1), np.int8)
+        found = next_free_cell(depth, camera.pinhole, *grid, rows, cell, 0, state)
+        assert found == (0 if is_in_image else 1)

@@ -15,7 +15,8 @@ from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import DEPARTURE_DISTANCE
 from drake_clutter.scenes.interfaces import Move
-from drake_clutter.scenes.placement import find_free_placements, resting_quaternion
+from drake_clutter.scenes.placement import find_free_placements
+from drake_clutter.scenes.release_orientation import resting_quaternion
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.station.station_simulation import StationSimulation
 

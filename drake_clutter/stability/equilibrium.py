@@ -209,19 +209,39 @@ def least_stable_object(table, shapes, p_T, pairs, margin, friction):  # type: i
             # The tolerance makes the first of identical objects the result, despite rounding.
             largest = np.nonzero(residual > residual.max() - 1e-9)[0]
             return largest[0], False
+    rolling = find_rolling_object(table, shapes, p_T, pairs, margins, margin, needed_friction)
+    return rolling, rolling >= 0
+
+
+@njit(cache=True)
+def find_rolling_object(table, shapes, p_T, pairs, margins, offset, friction):  # type: ignore[no-untyped-def]
+    """Return an object that is balanced on the line of a lying cylinder, or -1.
+
+    It does not balance with its center of mass moved to either side of the line.
+
+    Args:
+        table: Table of shapes, of type `SHAPE_DTYPE`. Shape (N,).
+        shapes: Row of each object's shape in the table. Shape (n,).
+        p_T: Origins of the objects in T [m]. Shape (n, 3).
+        pairs: Lower (or `GROUND`) and upper object of each contact. Shape (c, 2).
+        margins: Width by which the contacts below each object are shrunk [m]. Shape (n,).
+        offset: Distance by which the center of mass is moved [m].
+        friction: Coefficient of friction; 0 for vertical forces only.
+    """
+    com_offsets = np.zeros((len(shapes), 2))
     for lower, upper in pairs:
         if lower >= 0 and table[shapes[lower]].rolls:
             line = table[shapes[lower]].top[1] - table[shapes[lower]].top[0]
             for sign in (-1.0, 1.0):
-                com_offsets[upper, 0] = -sign * margin * line[1] / np.hypot(line[0], line[1])
-                com_offsets[upper, 1] = sign * margin * line[0] / np.hypot(line[0], line[1])
+                com_offsets[upper, 0] = -sign * offset * line[1] / np.hypot(line[0], line[1])
+                com_offsets[upper, 1] = sign * offset * line[0] / np.hypot(line[0], line[1])
                 residual = equilibrium_residuals(
-                    table, shapes, p_T, pairs, margins, com_offsets, needed_friction, NO_LOADS
+                    table, shapes, p_T, pairs, margins, com_offsets, friction, NO_LOADS
                 )
                 if residual.max() > 0:
-                    return upper, True
+                    return upper
             com_offsets[upper] = 0.0
-    return -1, False
+    return -1
 
 
 @njit(cache=True)

@@ -34,7 +34,7 @@ from drake_clutter.systems.perception_system import (
     LabelPerception,
     PerceptionFn,
     PerceptionSystem,
-    with_min_release_height,
+    with_image_tolerances,
 )
 from drake_clutter.systems.planner_system import PlannerSystem
 from drake_clutter.systems.policy_system import PolicyPhase, PolicyState, PolicySystem
@@ -101,7 +101,7 @@ class ClosedLoop:
         self._record_motion = record_motion
         self._perceive = perceive
         config = replace(config, cell=config.cell.with_support(scene.support))
-        self._config = config if perceive is None else with_min_release_height(config)
+        self._config = config if perceive is None else with_image_tolerances(config)
         self._detector = LabelDetector(config.cell.camera)
         self.perception = self._detector.perceive(scene)
         planner_config = PlannerConfig() if perceive is None else GUARDED_PLANNER_CONFIG

@@ -20,7 +20,7 @@ from drake_clutter.simulation.camera_renderer import CameraRenderer
 from drake_clutter.simulation.settle_executor import SettleExecutor
 from drake_clutter.station.body_sleep import nearest_object
 from drake_clutter.systems.action_filter import InfeasibleMoveFilter
-from drake_clutter.systems.perception_system import PerceptionFn, with_min_release_height
+from drake_clutter.systems.perception_system import PerceptionFn, with_image_tolerances
 from drake_clutter.systems.tracking import associate_detections, to_ground_truth_names
 from drake_clutter.tasks.belief import Decision
 from drake_clutter.tasks.episode import SteppedBackend
@@ -49,7 +49,7 @@ class ImageBackend(SteppedBackend):
             seed: Seed of all random numbers.
             config: Config of the cell, the simulation and the task.
         """
-        config = with_min_release_height(config)
+        config = with_image_tolerances(config)
         self._perceive = perceive
         self._seed = seed
         self._camera = CameraRenderer(config.cell.camera)
