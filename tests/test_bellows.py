@@ -75,7 +75,7 @@ def test_a_load_deflects_and_tilts_the_bellows(offset: float, time_step: float) 
 
     def moment(tilt: float) -> float:
         lever = offset * math.cos(tilt) - (CUP.hinge_distance + DEPTH) * math.sin(tilt)
-        return weight * lever - CUP.bending_stiffness * tilt
+        return float(weight * lever - CUP.bending_stiffness * tilt)
 
     tilt = float(brentq(moment, -0.5, 0.5))
     extension, about_x, about_y = bellows(station, root)

@@ -96,6 +96,7 @@ ADDED = {
 """Options that are added to a command of `drake-clutter` or a script, by its name."""
 
 PARSED = {
+    "carry_clearance",
     "collect_drake_verdicts",
     "evaluate_closed_loop",
     "evaluate_detector",

@@ -41,7 +41,7 @@ def test_a_torque_below_that_of_gravity_is_a_planning_failure() -> None:
     torques = (330.0, 40.0, 150.0, 56.0, 56.0, 56.0)
     limits = cell.robot.limits.model_copy(update={"torque": torques})
     weak = cell.model_copy(update={"robot": cell.robot.model_copy(update={"limits": limits})})
-    box = resting("sugar_box", xy=(0.25, 0.1))
+    box = resting("sugar_box", xy=(0.2, 0.1))
     failure = PickPlacePlanner(weak, PlannerConfig(optimize=False, max_attempts=10)).plan(
         [box], box.name, box.X_TO.translated(np.array([0.0, -0.2, 0.001]))
     )

@@ -241,6 +241,14 @@ class Gripper(Protocol):
             down_G: Direction of gravity in G, a unit vector. Shape (3,).
         """
 
+    def sag(self, tool: str, mass: float) -> float:
+        """Return the distance by which a load at rest hangs below its place in the rigid model [m].
+
+        Args:
+            tool: Name of the tool.
+            mass: Mass of the load [kg].
+        """
+
     def can_attach(self, tool: str, object_class: ObjectClass, X_OG: RigidTransform) -> bool:
         """Return whether a tool can attach to an object at a pose.
 

@@ -215,6 +215,10 @@ class ParallelJawGripper(StrictModel):
         """Return the largest acceleration of a load, see `Gripper`."""
         return max_payload_acceleration(mass, p_GCm, down_G, self.load_ratio, 1 / self.safety)
 
+    def sag(self, tool: str, mass: float) -> float:
+        """Return 0: the jaws are rigid."""
+        return 0.0
+
     def load_ratio(self, force: Floats, moment: Floats) -> Floats:
         """Return the ratio of a load to the load capacity; the object slips above 1.
 

@@ -38,7 +38,7 @@ from drake_clutter.cell.lip_seal import (
     profile_tilt,
     top_poses,
 )
-from drake_clutter.cell.payload_limits import max_payload_acceleration
+from drake_clutter.cell.payload_limits import GRAVITY, max_payload_acceleration
 from drake_clutter.cell.suction_cup import SuctionCup
 from drake_clutter.validation import InRange, StrictModel, rejected_error
 
@@ -250,6 +250,11 @@ class SuctionGripper(StrictModel):
         return max_payload_acceleration(
             mass, p_GCm, down_G, partial(self.load_ratio, tool), 1 / self.safety
         )
+
+    def sag(self, tool: str, mass: float) -> float:
+        """Return the extension of the bellows under a load, see `Gripper`."""
+        cup = self.cup(tool)
+        return min(mass * GRAVITY / cup.stiffness, cup.stroke)
 
     def load_ratio(self, tool: str, force: Floats, moment: Floats) -> Floats:
         """Return the ratio of a load to the load capacity of a cup; it detaches above 1.

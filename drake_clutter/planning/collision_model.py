@@ -336,6 +336,11 @@ class CollisionModel:
         owners = self._shape_owners[found.pairs]
         return np.asarray((owners[:, 0] == first) & (owners[:, 1] == second))
 
+    def is_of_attached(self, found: FoundDistances) -> NDArray[np.bool_]:
+        """Return whether each distance is one of the attached object. Shape (k,)."""
+        owner = self._owners[self._attached.name] if self._attached is not None else -1
+        return np.asarray(self._shape_owners[found.pairs[:, 0]] == owner)
+
     def is_to_arm(self, found: FoundDistances) -> NDArray[np.bool_]:
         """Return whether each distance is one to a part of the arm. Shape (k,)."""
         return np.asarray(self._is_of_arm[found.pairs[:, 1]])

@@ -45,6 +45,10 @@ from drake_clutter.simulation.scene_plant import rigid_transform
 Floats = NDArray[np.float64]
 
 
+_MAX_RAISES = 2
+"""How often a path is raised that is too low above what may stand below the object."""
+
+
 def _to_matrix(X_AB: RigidTransform) -> Floats:
     return np.ascontiguousarray(X_AB.GetAsMatrix4())
 
@@ -328,6 +332,8 @@ class PickPlaceSearch:
         )
         # In a bowl or a mug, the gripper rises above the rim before it moves sideways.
         recess = max(0.0, self._picked.top_height - candidate.X_TG_pick[2, 3])
+        if self._goal.X_TO_place is not None:  # else it is only lifted, straight up
+            gripper_height += self._segments.load_distance(candidate.tool)
         for bottom in self._transfer_heights:
             self.num_attempts += 1
             height = bottom + recess + gripper_height
@@ -346,18 +352,25 @@ class PickPlaceSearch:
         return None
 
     def _carry_path(self, candidate: GraspCandidate, height: float) -> CarryPath | str:
-        """Return the path with the object, or a description of the part that is out of reach."""
+        """Return the path with the object, or a description of the part that is out of reach.
+
+        A straight line in joint space is not level: it is raised until it is high enough above what
+        may stand below the object.
+        """
         tool = self._tools[candidate.tool]
-        if self._goal.X_TO_place is not None:
-            return tool.carry_path(
-                candidate.X_TG_pick,
-                candidate.X_TG_place,
-                height,
-                candidate.q_pick,
-                candidate.q_place,
-            )
-        lift = tool.lift_path(candidate.X_TG_pick, height, candidate.q_pick)
-        return "above the grasp" if lift is None else CarryPath(lift, lift[-1:], lift[-1:])
+        if self._goal.X_TO_place is None:
+            lift = tool.lift_path(candidate.X_TG_pick, height, candidate.q_pick)
+            return "above the grasp" if lift is None else CarryPath(lift, lift[-1:], lift[-1:])
+        ends = candidate.X_TG_pick, candidate.X_TG_place
+        for _ in range(_MAX_RAISES + 1):
+            path = tool.carry_path(*ends, height, candidate.q_pick, candidate.q_place)
+            if isinstance(path, str):
+                break
+            shortfall = -self._segments.column_slack(candidate, path.waypoints)
+            if shortfall <= 0:
+                break
+            height += shortfall
+        return path
 
     def _make_move(
         self,

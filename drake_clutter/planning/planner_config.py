@@ -1,5 +1,6 @@
 """Parameters of the pick-and-place planner."""
 
+from drake_clutter.planning.carry_clearance import CarryClearance
 from drake_clutter.validation import CountOrZero, Flag, NonNegative, config_class, renamed_fields
 
 
@@ -37,6 +38,7 @@ class PlannerConfig:
             until contact is detected [m]. 0 disables the guarded descent.
         descent_start_offset: Height above the place pose at which the guarded descent starts [m].
             If the arm cannot descend by this much, the object is released at the place pose.
+        carry_clearance: Errors for which a carried object keeps a larger distance.
         optimize: Whether trajectory optimization shortens the duration of a plan.
     """
 
@@ -51,4 +53,5 @@ class PlannerConfig:
     time_limit: NonNegative = 600.0
     max_guarded_descent: NonNegative = 0.0
     descent_start_offset: NonNegative = 0.0
+    carry_clearance: CarryClearance = CarryClearance()
     optimize: Flag = True

@@ -16,6 +16,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.planning.carry_clearance import CarriedBox, Column, columns_below, worst_slack
 from drake_clutter.planning.collision_model import CollisionModel, SignedDistance
 from drake_clutter.planning.cubic_spline import CubicSpline
 from drake_clutter.planning.motion_limits import LimitViolation, MotionLimits, scale_to_limits
@@ -41,6 +42,7 @@ from drake_clutter.planning.tool_kinematics import (
     raise_pose,
 )
 from drake_clutter.planning.trajectory_optimization import (
+    MIN_VERTICAL_TRAVEL,
     LinearizedDistances,
     TrajectoryOptimizationProblem,
     optimize_trajectory,
@@ -59,6 +61,8 @@ poses of objects at rest have slight penetrations."""
 OPTIMIZATION_MARGIN = 0.005
 """Distance that trajectory optimization keeps in addition to `PlannerConfig.min_distance` [m]. It
 imposes distances at few points; the check afterwards is dense."""
+COLUMN_MARGIN = 0.002
+"""Distance that trajectory optimization keeps from columns in addition to the required one [m]."""
 INFLUENCE_DISTANCE = 0.06
 """Distances above this are ignored by trajectory optimization [m]."""
 MAX_CARRY_TILT = math.radians(0.5)
@@ -164,10 +168,18 @@ class SegmentPlanner:
         self._failures = failures
         self._tools = tools
         self._robot = load_robot(cell.robot)
+        mass = picked.object_class.mass
+        self._load_distances = {
+            name: config.carry_clearance.of_load(cell.gripper.sag(name, mass)) for name in tools
+        }
         self._grasp_contacts = {
             name: [(link, picked.name) for link in tool.contact_links]
             for name, tool in cell.gripper.tools.items()
         }
+
+    def load_distance(self, tool: str) -> float:
+        """Return the distance that a held object keeps in addition to `min_distance` [m]."""
+        return self._load_distances[tool]
 
     def min_distance_along(
         self, path: Floats, endpoint: EndpointContext, progress: int, stage: str
@@ -196,7 +208,7 @@ class SegmentPlanner:
                 nearest.distance,
             )
             return None
-        counts = (required == min_distance) & ~model.is_to_arm(found)
+        counts = (required >= min_distance) & ~model.is_to_arm(found)
         if not counts.any():
             return SignedDistance(math.inf)
         return model.signed_distance(found, int(np.where(counts, found.distances, np.inf).argmin()))
@@ -213,15 +225,18 @@ class SegmentPlanner:
             found: Distances along the path. Length k.
             path: Configurations. Shape (m, n).
             endpoint: Endpoint near which smaller distances are allowed.
-            min_distance: Required distance of all other pairs [m].
+            min_distance: Required distance of all other pairs [m]; a held object keeps more.
         """
         p_TG = self._collision_model.tool_positions(endpoint.tool, path)
         offsets = np.hypot(*(p_TG[:, :2] - endpoint.p_TG_xy).T)
         contacts = dict.fromkeys(self._grasp_contacts[endpoint.tool], self._config.lip_gap / 2)
         required = np.full(len(found.rows), min_distance)
+        required[self._collision_model.is_of_attached(found)] += self.load_distance(endpoint.tool)
         for pair, allowed in {**endpoint.allowed_distances, **contacts}.items():
             of_pair = self._collision_model.is_between(found, pair)
-            required[of_pair] = np.minimum(min_distance, allowed + offsets[found.rows[of_pair]])
+            required[of_pair] = np.minimum(
+                required[of_pair], allowed + offsets[found.rows[of_pair]]
+            )
         return required
 
     def distances_below_object(
@@ -248,7 +263,8 @@ class SegmentPlanner:
     def contact_distances(self, q: Floats) -> dict[tuple[str, str], float]:
         """Return the allowed distances to neighbors of the attached object, by names [m]."""
         name = self._picked.name
-        distances = self._collision_model.distances_below(q, self._config.min_distance)
+        reach = self._config.min_distance + max(self._load_distances.values())
+        distances = self._collision_model.distances_below(q, reach)
         of_object = [distance for distance in distances if distance.pair[0] == name]
         # A neighbor may have several geometries: the smallest distance is the last and is kept.
         return {
@@ -386,6 +402,11 @@ class SegmentPlanner:
         if segment_name != "carry":
             context = self._arm_context(segment_name, endpoints)
             return self.min_distance_along(points, context, progress, segment_name)
+        slack = self.column_slack(candidate, points)
+        if slack < 0:
+            detail = f"carry: {self._picked.name} and what may be below it"
+            self._failures.record(progress, PlanningFailureReason.IN_COLLISION, detail, slack)
+            return None
         half = len(points) // 2
         from_pick = self.min_distance_along(points[:half], endpoints[0], progress, segment_name)
         if from_pick is None:
@@ -423,6 +444,67 @@ class SegmentPlanner:
             )
         return tilt > MAX_CARRY_TILT
 
+    def _columns(self, candidate: GraspCandidate) -> tuple[Column, ...]:
+        """Return the space below the object that something may occupy where it is at rest."""
+        below_pick, below_place = columns_below(
+            self._picked,
+            replace(self._picked, X_TO=self._X_TO_place),
+            candidate.X_OG,
+            np.array([candidate.X_TG_pick, candidate.X_TG_place]),
+            self._config.carry_clearance,
+        )
+        columns = (
+            below_pick if self._start is not None else None,
+            below_place if self._releases else None,
+        )
+        return tuple(column for column in columns if column is not None)
+
+    def _column_clearance(self, candidate: GraspCandidate) -> float:
+        """Return the height that a carried object keeps above columns [m]."""
+        return self._config.min_distance + self.load_distance(candidate.tool)
+
+    def _carried_box(self, candidate: GraspCandidate, path: Floats) -> CarriedBox:
+        """Return the box of the carried object along a path. Shape (m, n)."""
+        X_TG = self._tools[candidate.tool].pose(path)
+        return CarriedBox.along(self._picked.object_class, candidate.X_OG, X_TG)
+
+    def column_slack(self, candidate: GraspCandidate, path: Floats) -> float:
+        """Return how far a path is from violating the clearance of the columns, see `worst_slack`.
+
+        Args:
+            candidate: Grasp.
+            path: Configurations with the object. Shape (m, n).
+        """
+        return worst_slack(
+            self._columns(candidate),
+            self._carried_box(candidate, path),
+            self._column_clearance(candidate),
+            self._config.carry_clearance.max_drift,
+        )
+
+    def _column_distances(self, candidate: GraspCandidate, q: Floats) -> LinearizedDistances:
+        """Return the distances of the carried object from columns, for the optimization.
+
+        Args:
+            candidate: Grasp.
+            q: Configurations. Shape (m, n).
+        """
+        box = self._carried_box(candidate, q)
+        clearance = self._column_clearance(candidate)
+        slacks = [column.slack(box, clearance, 0.0) for column in self._columns(candidate)]
+        J = np.array([self._collision_model.tool_jacobian(candidate.tool, at) for at in q])
+        moments = [np.cross(slack.points - box.p_TG, slack.directions) for slack in slacks]
+        gradients = np.vstack(
+            [
+                np.einsum("mi,mij->mj", np.hstack([moment, slack.directions]), J)
+                for moment, slack in zip(moments, slacks, strict=True)
+            ]
+        )
+        values = np.concatenate([slack.values for slack in slacks]) - COLUMN_MARGIN
+        is_near = values < INFLUENCE_DISTANCE
+        rows = np.tile(np.arange(len(q)), len(slacks))
+        return LinearizedDistances(rows[is_near], gradients[is_near], values[is_near])
+
     def _optimize_segment(
         self,
         segment: TrajectorySegment,
@@ -449,16 +531,22 @@ class SegmentPlanner:
             varies = np.abs(found.gradients).max(axis=1, initial=0.0) > 1e-6
             return LinearizedDistances(found.rows[varies], found.gradients[varies], slack[varies])
 
+        height = self._column_clearance(candidate)
+        vertical = (0.0, height, height) if is_carry else MIN_VERTICAL_TRAVEL
+        starts_at_object = segment.name == "retreat" or (is_carry and self._start is not None)
+        ends_at_object = segment.name == "approach" or (is_carry and self._releases)
+        has_columns = is_carry and (starts_at_object or ends_at_object)
         limits = MotionLimits(self._cell, payload)
         problem = TrajectoryOptimizationProblem(
             initial_trajectory=segment.trajectory,
             robot=self._robot,
-            vertical_start=segment.name != "approach",
-            vertical_end=segment.name != "retreat",
+            vertical_start=vertical if starts_at_object else (),
+            vertical_end=vertical if ends_at_object else (),
             keep_tool_vertical=is_carry,
             max_tool_speed=limits.max_tool_speed,
             max_tool_acceleration=payload.max_axis_acceleration,
             nearby_distances=nearby_distances,
+            column_distances=partial(self._column_distances, candidate) if has_columns else None,
             tool_jacobian=partial(self._collision_model.tool_jacobian, candidate.tool),
             tool_axis=self._tools[candidate.tool].axis,
         )

@@ -18,6 +18,8 @@ Floats = NDArray[np.float64]
 
 DEPARTURE_DISTANCE = 0.02
 """Distance that a tilted tool moves along its axis at the start of a lift [m]."""
+_CORNER_HEIGHT = 0.02
+"""Height over which a path changes from vertical to horizontal motion [m]."""
 _MAX_POSE_STEP = 0.02
 """Largest distance between neighboring poses of a straight line [m]."""
 
@@ -75,9 +77,15 @@ def raise_pose(X_TG: Floats, height: float) -> Floats:
 
 
 def _vertical_line(X_TG: Floats, top: float) -> Floats:
-    """Return poses from X_TG vertically up to a height [m]. Shape (m, 4, 4)."""
-    count = max(2, math.ceil((top - X_TG[2, 3]) / _MAX_POSE_STEP) + 1)
-    heights = np.linspace(X_TG[2, 3], top, count)
+    """Return poses from X_TG vertically up to a height [m]. Shape (m, 4, 4).
+
+    The last steps are so short that a cubic B-spline with these poses as control points leaves the
+    line no lower than `_CORNER_HEIGHT` below its top: there, it depends on the last three poses.
+    """
+    bottom = X_TG[2, 3]
+    corner = max(bottom, top - _CORNER_HEIGHT)
+    below = np.linspace(bottom, corner, math.ceil((corner - bottom) / _MAX_POSE_STEP) + 1)
+    heights = np.array([*below, (corner + top) / 2, top])
     X = np.broadcast_to(X_TG, (len(heights), 4, 4)).copy()
     X[:, 2, 3] = heights
     return X

@@ -45,9 +45,9 @@ NUM_COLLISION_SAMPLES = 50
 second one."""
 CONVERGENCE_TOLERANCE = 0.02
 """Change of the control points [rad], and relative change of the duration, at convergence."""
-MIN_VERTICAL_TRAVEL = 0.002
-"""Vertical travel of the tool after the grasp and before the place pose [m]: an object that moves
-sideways while it is lifted drags its neighbors along."""
+MIN_VERTICAL_TRAVEL = (0.0, 0.002)
+"""Heights of the first free control points above the grasp and the place pose, on the vertical line
+through it, if the tool holds nothing [m]: it leaves an object upwards."""
 ENDPOINT_FRACTION = 0.15
 """Fraction of the path at either end where distances below the required ones are not increased: the
 fixed endpoints leave no freedom there."""
@@ -109,13 +109,17 @@ class TrajectoryOptimizationProblem:
     Attributes:
         initial_trajectory: Collision-free, time-parameterized initial guess.
         robot: Robot with its joint limits.
-        vertical_start: Whether the tool first moves vertically up.
-        vertical_end: Whether the tool last moves vertically down.
+        vertical_start: Least heights above the start of the first free control points, which are on
+            the vertical line through it [m]; empty if the tool may move in any direction.
+        vertical_end: Likewise above the end, for the last free control points [m].
         keep_tool_vertical: Whether the tool axis stays vertical.
         max_tool_speed: Largest speed of the tool [m/s]; infinite without a limit.
         max_tool_acceleration: Largest acceleration of the tool along each axis [m/s^2].
         nearby_distances: Returns all distances below the influence distance, from joint positions
             of shape (m, n) and the path parameters s in [0, 1] of shape (m,).
+        column_distances: Returns the distances from the columns below a carried object, like
+            `nearby_distances`, from joint positions of shape (m, n); they are also imposed at the
+            ends of the path, but for its vertical parts. None without an object.
         tool_jacobian: Returns the spatial Jacobian of the tool, angular rows first, shape (6, n),
             from joint positions of shape (n,).
         tool_axis: Returns the z axis of the tool in T, shape (3,), from joint positions of shape
@@ -124,12 +128,13 @@ class TrajectoryOptimizationProblem:
 
     initial_trajectory: Trajectory
     robot: RobotModel
-    vertical_start: bool
-    vertical_end: bool
+    vertical_start: tuple[float, ...]
+    vertical_end: tuple[float, ...]
     keep_tool_vertical: bool
     max_tool_speed: float
     max_tool_acceleration: float
     nearby_distances: Callable[[Floats, Floats], LinearizedDistances]
+    column_distances: Callable[[Floats], LinearizedDistances] | None
     tool_jacobian: Callable[[Floats], Floats]
     tool_axis: Callable[[Floats], Floats]
 
@@ -204,6 +209,22 @@ class _LinearConstraints:
         for sign in (1, -1):
             self.add(sign * A_points, -bound, np.zeros_like(bound) if b is None else b)
 
+    def add_distances(self, distances: LinearizedDistances, q: Floats) -> None:
+        """Add that distances at samples of the spline are not below the required ones.
+
+        Args:
+            distances: Distances, linearized at the previous solution.
+            q: Samples of that solution. Shape (NUM_COLLISION_SAMPLES, n).
+        """
+        index, gradients = distances.rows, distances.gradients
+        if not len(index):
+            return
+        self.add(
+            _directional_matrix(-_VALUE_WEIGHTS[index], gradients),
+            np.zeros(len(index)),
+            distances.slack - (gradients * q[index]).sum(axis=1),
+        )
+
     def add_to(self, prog: MathematicalProgram, x: NDArray[np.object_]) -> None:
         """Add the constraints to a program with the variables x = (p, T^2)."""
         b = np.concatenate(self._b)
@@ -225,6 +246,14 @@ def _directional_matrix(weights: Floats, directions: Floats) -> sparse.csr_matri
     return sparse.csr_matrix(
         (weights[:, :, None] * directions[:, None, :]).reshape(len(weights), -1)
     )
+
+
+def _is_vertical(problem: TrajectoryOptimizationProblem) -> NDArray[np.bool_]:
+    """Return which samples depend on control points on the vertical lines alone. Shape (m,)."""
+    num_spans = NUM_CONTROL_POINTS - _SPLINE_ORDER + 1
+    spans = _SAMPLE_PARAMETERS * num_spans
+    num_start, num_end = len(problem.vertical_start), len(problem.vertical_end)
+    return np.asarray((spans < num_start) | (num_spans - spans < num_end))
 
 
 def _limit_constraints(
@@ -259,11 +288,14 @@ def _limit_constraints(
         index, gradients = nearby.rows, nearby.gradients
         is_near_end = np.minimum(_SAMPLE_PARAMETERS, 1 - _SAMPLE_PARAMETERS) < ENDPOINT_FRACTION
         slack = np.where(is_near_end[index], np.maximum(nearby.slack, 0.0), nearby.slack)
-        constraints.add(
-            _directional_matrix(-_VALUE_WEIGHTS[index], gradients),
-            np.zeros(len(index)),
-            slack - (gradients * q[index]).sum(axis=1),
+        constraints.add_distances(LinearizedDistances(index, gradients, slack), q)
+    if problem.column_distances is not None:
+        columns = problem.column_distances(q)
+        is_kept = ~_is_vertical(problem)[columns.rows]
+        kept = LinearizedDistances(
+            columns.rows[is_kept], columns.gradients[is_kept], columns.slack[is_kept]
         )
+        constraints.add_distances(kept, q)
     if math.isfinite(problem.max_tool_speed):
         J = np.array([problem.tool_jacobian(at)[3:] for at in q])
         velocities = (J @ (_DERIVATIVE_WEIGHTS @ points)[:, :, None])[:, :, 0]
@@ -306,8 +338,9 @@ def _add_vertical_tool_constraints(
         for q in control:
             prog.AddLinearEqualityConstraint(rows, rows @ points[0], q)
         return
-    num_vertical = NUM_FIXED_CONTROL_POINTS + 2
-    for k in range(num_vertical, NUM_CONTROL_POINTS - num_vertical):
+    start = NUM_FIXED_CONTROL_POINTS + len(problem.vertical_start)
+    end = NUM_CONTROL_POINTS - NUM_FIXED_CONTROL_POINTS - len(problem.vertical_end)
+    for k in range(start, end):
         x, y, z = problem.tool_axis(points[k])
         J_rotation = problem.tool_jacobian(points[k])[:3]
         # Derivatives of x and y of the tool axis: the first two rows of w x axis.
@@ -332,15 +365,13 @@ def _add_vertical_motion_constraints(
         control: Variables of the control points. Shape (28, n).
     """
     num_fixed = NUM_FIXED_CONTROL_POINTS
-    for is_vertical, end, inwards in (
+    for heights, end, inwards in (
         (problem.vertical_start, 0, 1),
         (problem.vertical_end, NUM_CONTROL_POINTS - 1, -1),
     ):
-        if not is_vertical:
-            continue
         J = problem.tool_jacobian(points[end])
         q = points[end]
-        for k, min_height in ((num_fixed, 0.0), (num_fixed + 1, MIN_VERTICAL_TRAVEL)):
+        for k, min_height in enumerate(heights, start=num_fixed):
             variables = control[end + inwards * k]
             prog.AddLinearEqualityConstraint(J[:5], J[:5] @ q, variables)
             prog.AddLinearConstraint(J[5:], J[5:] @ q + min_height, [np.inf], variables)
@@ -392,4 +423,8 @@ def _solve_subproblem(
     if not result.is_success():
         return None
     solution = result.GetSolution(x)
-    return solution[:-1].reshape(points.shape), math.sqrt(solution[-1])
+    new_points = solution[:-1].reshape(points.shape)
+    # The solver keeps them to its tolerance.
+    new_points[:num_fixed] = points[:num_fixed]
+    new_points[-num_fixed:] = points[-num_fixed:]
+    return new_points, math.sqrt(solution[-1])
