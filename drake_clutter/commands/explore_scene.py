@@ -16,7 +16,13 @@ from drake_clutter.planning.pick_place_plan import (
     PlanningFailureReason,
     plan_to_dict,
 )
+from drake_clutter.planning.plan_export import (
+    SUFFIXES,
+    check_export,
+    export_plan,
+)
 from drake_clutter.reports.episode_page import write_episode_page
+from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.interfaces import Move, Observation
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import TRAY, Scene
@@ -35,6 +41,8 @@ EPISODE_FILE = "episode.json"
 """File of an episode's document, which is written last."""
 PLAN_FILE = "plan.json"
 """File of planned moves."""
+DEFAULT_EXPORT_RATE = 500.0
+"""Rate of exported samples [Hz]: that of the controller of UR arms since the e-Series."""
 
 TransitionCallback = Callable[[Transition], None]
 """Function that is called with each transition of an episode."""
@@ -97,13 +105,14 @@ def _check_move(moves: Sequence[Move], index: int, visible: Sequence[str], scene
         ("pick", move.pick, visible),
         ("place", move.place, [TRAY, *visible]),
     ):
+        if role == "place" and move.place_values is not None:
+            continue
         if name not in allowed or (role == "place" and name == move.pick):
             problem = "is not in the scene"
             if name in (*scene.names, TRAY):
                 problem = "is not in view, or the picked object itself"
-            raise InputError(
-                f"move {index + 1}, {role}: {name!r} {problem}; expected {', '.join(allowed)}"
-            )
+            choices = ", ".join([*allowed, "X,Y,Z,YAW"] if role == "place" else allowed)
+            raise InputError(f"move {index + 1}, {role}: {name!r} {problem}; expected {choices}")
 
 
 def execute_moves(
@@ -147,11 +156,18 @@ def execute_moves(
 
 
 def plan_moves(
-    scene: Scene, moves: Sequence[Move], seed: int, config: ClutterConfig, out: Path
+    scene: Scene,
+    moves: Sequence[Move],
+    seed: int,
+    config: ClutterConfig,
+    out: Path,
+    exports: Sequence[str] = (),
+    rate: float = DEFAULT_EXPORT_RATE,
 ) -> list[dict[str, Any]]:
     """Plan the arm's motion for each move without executing it; write `plan.json`.
 
-    Every move is planned for the scene as it is, not for the scene after the moves before.
+    Every move is planned for the scene as it is, not for the scene after the moves before. The
+    exported files are `plan.csv` and `plan.script`; of several moves `plan_1.csv`, and so on.
 
     Args:
         scene: Scene at rest.
@@ -159,13 +175,19 @@ def plan_moves(
         seed: Seed of placements.
         config: Configuration.
         out: Output folder.
+        exports: Formats in which the plans are exported, keys of `SUFFIXES`.
+        rate: Rate of the exported samples [Hz].
 
     Returns:
         The plans as documents.
 
     Raises:
-        InputError: A move names an object that is not visible, or places an object on itself.
+        InputError: A move names an object that is not visible, or places an object on itself; or
+            the robot does not understand an export format.
     """
+    robot = load_robot(config.cell.robot)
+    for export_format in exports:
+        check_export(export_format, rate, robot)
     perception = LabelDetector(config.cell.camera).perceive(scene)
     rng = item_rng(seed)
     executor = ArmExecutor(config)
@@ -179,6 +201,12 @@ def plan_moves(
             else executor.plan(scene, command)
         )
         plans.append({"move": {"pick": move.pick, "place": move.place}, **plan_to_dict(plan)})
+        if isinstance(plan, PlanningFailure):
+            continue
+        name = "plan" if len(moves) == 1 else f"plan_{index + 1}"
+        for export_format in exports:
+            path = out / f"{name}{SUFFIXES[export_format]}"
+            export_plan(plan, path, export_format, rate, robot, [*config.cell.gripper.tools])
     write_json(
         out / PLAN_FILE,
         {"seed": seed, "cell": to_plain(config.cell.with_support(scene.support)), "plans": plans},
@@ -192,12 +220,12 @@ class _MoveEntry(StrictModel):
 
 
 def read_moves(path: Path) -> list[Move]:
-    """Return the moves of a YAML list of `{pick: NAME, place: NAME or tray}`.
+    """Return the moves of a YAML list of `{pick: NAME, place: NAME, tray or "X,Y,Z,YAW"}`.
 
     Raises:
         InputError: The file or one of its entries cannot be used.
     """
-    content = f"a list of {{pick: NAME, place: NAME or {TRAY}}}"
+    content = f'a list of {{pick: NAME, place: NAME, {TRAY} or "X,Y,Z,YAW"}}'
     entries = validate(tuple[_MoveEntry, ...], read_yaml(path, content), str(path))
     if not entries:
         raise input_error(str(path), f"holds no moves; expected {content}")

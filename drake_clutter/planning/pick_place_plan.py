@@ -53,6 +53,22 @@ class PlanningFailureReason(Enum):
     TIME_OUT = "time out"
 
 
+_UNITS = {
+    PlanningFailureReason.NO_SEAL: (1000.0, "mm"),
+    PlanningFailureReason.NO_OPPOSED_FACES: (1000.0, "mm"),
+    PlanningFailureReason.TOO_HEAVY: (1.0, "kg"),
+    PlanningFailureReason.PLACE_IN_COLLISION: (1000.0, "mm"),
+    PlanningFailureReason.PLACE_TILTED: (math.degrees(1.0), "deg"),
+    PlanningFailureReason.PLACE_UNSUPPORTED: (1000.0, "mm"),
+    PlanningFailureReason.PLACE_OFF_BALANCE: (1000.0, "mm"),
+    PlanningFailureReason.IN_COLLISION: (1000.0, "mm"),
+    PlanningFailureReason.JOINT_LIMIT: (1.0, "rad"),
+    PlanningFailureReason.GRASP_TOO_WEAK: (1.0, "m/s^2"),
+    PlanningFailureReason.TIME_OUT: (1.0, "s"),
+}
+"""Factor and unit with which the value of a failure is shown; other values have several units."""
+
+
 @dataclass(frozen=True)
 class PlanningFailure:
     """The reason why there is no plan.
@@ -77,6 +93,14 @@ class PlanningFailure:
 
     def __str__(self) -> str:
         return f"{self.reason.value}{f': {self.detail}' if self.detail else ''}"
+
+    @property
+    def quantity(self) -> str:
+        """The value with its unit; empty without one."""
+        if math.isnan(self.value) or self.reason not in _UNITS:
+            return ""
+        scale, unit = _UNITS[self.reason]
+        return f"{scale * self.value:.3g} {unit}"
 
 
 class FailureLog:
@@ -341,6 +365,7 @@ def plan_to_dict(plan: PickPlacePlan | PlanningFailure) -> dict[str, Any]:
             "reason": plan.reason.value,
             "detail": plan.detail,
             "value": value,
+            "quantity": plan.quantity,
             "planning_time": plan.planning_time,
         }
     pose = plan.X_TO_place

@@ -313,13 +313,15 @@ def _arm_figures(
 def _place_pose(scene: Scene, step: Transition) -> Pose | None:
     """Return X_TO where the picked object was released.
 
-    Of a move that was not executed, the pose is above the object that it names; None for the tray.
+    Of a move that was not executed, it is the pose that the move gives, or above the object that it
+    names; None for the tray.
     """
     if step.outcome.result.was_executed:
         return step.outcome.X_TO_released or step.outcome.scene[step.move.pick].X_TO
-    if step.move.place == TRAY:
-        return None
-    return Pose(scene[step.move.place].X_TO.translation, scene[step.move.pick].X_TO.quaternion)
+    X_TO_pick = scene[step.move.pick].X_TO
+    if step.move.place == TRAY or step.move.place_values is not None:
+        return step.move.place_pose(X_TO_pick)
+    return Pose(scene[step.move.place].X_TO.translation, X_TO_pick.quaternion)
 
 
 def _pick_probabilities_html(step: Transition, scene: Scene) -> str:

@@ -120,7 +120,8 @@ def describe_plans(plans: Sequence[Mapping[str, Any]]) -> dict[str, str]:
 
 def _describe_plan(plan: Mapping[str, Any]) -> str:
     if not plan["planned"]:
-        return f"no plan: {': '.join(filter(None, (plan['reason'], plan['detail'])))}"
+        quantity = f" ({plan['quantity']})" if plan.get("quantity") else ""
+        return f"no plan: {': '.join(filter(None, (plan['reason'], plan['detail'])))}{quantity}"
     segments = [f"{segment['name']} {segment['duration']:.2f} s" for segment in plan["segments"]]
     distances = [s["min_distance"] for s in plan["segments"] if s["min_distance"] is not None]
     nearest = f"{1000 * min(distances):.0f} mm" if distances else "farther than 30 mm"

@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.camera import Camera
@@ -148,11 +149,33 @@ class Move:
 
     Attributes:
         pick: Name of the object to pick.
-        place: Name of the object to place it on, or `TRAY`.
+        place: Name of the object to place it on, or `TRAY`; or a pose `X,Y,Z,YAW`: the position of
+            the picked object's origin in T [m], and its turn about the vertical [deg].
     """
 
     pick: str
     place: str = TRAY
+
+    @property
+    def place_values(self) -> tuple[float, float, float, float] | None:
+        """x, y, z [m] and yaw [deg] if the place is a pose, else None."""
+        try:
+            x, y, z, yaw = (float(part) for part in self.place.split(","))
+        except ValueError:
+            return None
+        return (x, y, z, yaw) if all(map(math.isfinite, (x, y, z, yaw))) else None
+
+    def place_pose(self, X_TO_pick: Pose) -> Pose | None:
+        """Return X_TO at the place if it is a pose, else None.
+
+        Args:
+            X_TO_pick: Pose of the picked object, whose orientation is turned.
+        """
+        if self.place_values is None:
+            return None
+        *p_TO, yaw = self.place_values
+        R = Rotation.from_euler("z", yaw, degrees=True).as_matrix()
+        return Pose.from_rotation(R @ X_TO_pick.rotation, p_TO)
 
     def __str__(self) -> str:
         return f"{self.pick} -> {self.place}"

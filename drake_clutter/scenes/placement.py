@@ -424,6 +424,8 @@ def resolve_placement(
 ) -> PickPlaceCommand | None:
     """Return the command for a move, or None if no placement is known to be free.
 
+    A place that is a pose is taken as it is.
+
     Args:
         move: What to pick and where to put it.
         observation: Observation before the pick.
@@ -436,9 +438,12 @@ def resolve_placement(
     """
     if move.place == move.pick:
         raise ValueError(f"move {move}: expected another object, or {TRAY}, as the place")
+    X_TO_pick = observation[move.pick].X_TO
+    if (X_TO_place := move.place_pose(X_TO_pick)) is not None:
+        return PickPlaceCommand(move, X_TO_pick, X_TO_place)
     placements = find_free_placements(observation, move, config)
     if placements is None:
         return None
     x, y, z = placements.translations[rng.integers(len(placements.translations))].tolist()
     X_TO_place = Pose((x, y, z), placements.quaternion)
-    return PickPlaceCommand(move, observation[move.pick].X_TO, X_TO_place)
+    return PickPlaceCommand(move, X_TO_pick, X_TO_place)

@@ -57,7 +57,11 @@ class StaticExecutor:
         As in Drake, objects that the move does not touch stay at rest. If a touched object rests
         before the move although the static model lets it fall, the verdict is inconclusive.
         """
-        for name in (move.pick,) if move.place == TRAY else (move.pick, move.place):
+        below: tuple[str, ...] = () if move.place == TRAY else (move.place,)
+        if move.place_values is not None:
+            touched = self._judge.contact_group(after, move.pick).names
+            below = tuple(name for name in touched if name != move.pick)
+        for name in (move.pick, *below):
             verdict = self._judge.find_instability(self._judge.contact_group(before, name))
             if isinstance(verdict, Instability):
                 return InconclusiveVerdict(InconclusiveReason.RESTS_NEVERTHELESS, verdict.object)
