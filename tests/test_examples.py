@@ -22,6 +22,8 @@ CASES = {
     "08_add_object_class": ["--nodes", "6"],
     "09_train_maskable_ppo": ["--steps", "1"],
     "10_own_objects": [],
+    "11_compose_motions": [],
+    "12_own_trajectory": [],
 }
 """Options for a short run of each script."""
 HAS_MASKABLE_PPO = importlib.util.find_spec("sb3_contrib") is not None
