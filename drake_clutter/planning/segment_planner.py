@@ -550,24 +550,23 @@ class SegmentPlanner:
             tool_jacobian=partial(self._collision_model.tool_jacobian, candidate.tool),
             tool_axis=self._tools[candidate.tool].axis,
         )
-        optimized = optimize_trajectory(problem)
-        if optimized is None:
-            return segment
-        trajectory = scale_to_limits(optimized, limits)
-        if (
-            isinstance(trajectory, LimitViolation)
-            or trajectory.end_time >= segment.unoptimized_duration
-        ):
-            return segment
-        # Optimized paths pass obstacles closely: the check is denser than that of the initial path.
-        closest = self._check_segment(
-            segment.name, trajectory, candidate, endpoints, 0, MAX_JOINT_STEP / 4
-        )
-        if closest is None:
-            return segment
-        return TrajectorySegment(
-            segment.name, trajectory.to_trajectory(), closest, segment.unoptimized_duration
-        )
+        for optimized in optimize_trajectory(problem):
+            trajectory = scale_to_limits(optimized, limits)
+            if (
+                isinstance(trajectory, LimitViolation)
+                or trajectory.end_time >= segment.unoptimized_duration
+            ):
+                continue
+            # Optimized paths pass obstacles closely: the check is denser than that of the initial
+            # path.
+            closest = self._check_segment(
+                segment.name, trajectory, candidate, endpoints, 0, MAX_JOINT_STEP / 4
+            )
+            if closest is not None:
+                return TrajectorySegment(
+                    segment.name, trajectory.to_trajectory(), closest, segment.unoptimized_duration
+                )
+        return segment
 
     def plan_guarded_descent(
         self, candidate: GraspCandidate, place: EndpointContext, q_place: Floats
