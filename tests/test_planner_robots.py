@@ -171,6 +171,20 @@ def with_wall(translation: tuple[float, float, float], box: tuple[float, float, 
     return DEFAULT_CELL.model_copy(update={"fixtures": (*DEFAULT_CELL.fixtures, wall)})
 
 
+def test_jacobians_of_the_tool_are_derivatives_of_its_pose() -> None:
+    for cell in (DEFAULT_CELL, load_cell(resource_path("models/cells/iiwa14_epick_tray.yaml"))):
+        for tool in PickPlacePlanner(cell, PlannerConfig()).tools.values():
+            q = rng(2).uniform(-1.0, 1.0, (3, tool.robot.num_joints))
+            jacobians = tool.jacobians(q)
+            R = tool.pose(q)[:, :3, :3]
+            for joint, dq in enumerate(1e-6 * np.eye(tool.robot.num_joints)):
+                dX = (tool.pose(q + dq) - tool.pose(q - dq)) / 2e-6
+                spin = dX[:, :3, :3] @ R.swapaxes(1, 2)
+                angular = np.array([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]]).T
+                expected = np.hstack([angular, dX[:, :3, 3]])
+                assert jacobians[:, :, joint] == pytest.approx(expected, abs=1e-7)
+
+
 def test_fixtures_of_the_cell_are_avoided() -> None:
     box, X_TO = PILE[0], place_pose(PILE[0], 0.20, -0.25, 0.0)
     between = PickPlacePlanner(with_wall((0.12, -0.15, 0.13), (0.05, 0.05, 0.26)), PlannerConfig())

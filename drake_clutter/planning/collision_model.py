@@ -476,26 +476,6 @@ class CollisionModel:
         p_FG = self._tools[tool].X_FG.translation()
         return np.asarray(X_TF[:, :3, :3] @ p_FG + X_TF[:, :3, 3])
 
-    def tool_jacobian(self, tool: str, q: Floats) -> Floats:
-        """Return the spatial Jacobian of G in T, angular rows first. Shape (6, n).
-
-        Args:
-            tool: Name of the tool.
-            q: Joint positions of the arm. Shape (n,).
-        """
-        self._q[self._q_indices] = q
-        self.plant.SetPositions(self._context, self._q)
-        world = self.plant.world_frame()
-        J = self.plant.CalcJacobianSpatialVelocity(
-            self._context,
-            JacobianWrtVariable.kV,
-            self._arm.tools[tool],
-            np.zeros(3),
-            world,
-            world,
-        )
-        return np.asarray(J[:, self._v_indices])
-
     def _num_moving_joints(self, geometry: GeometryId) -> int:
         if geometry in self._geometry_depths:
             return self._geometry_depths[geometry]

@@ -492,7 +492,7 @@ class SegmentPlanner:
         box = self._carried_box(candidate, q)
         clearance = self._column_clearance(candidate)
         slacks = [column.slack(box, clearance, 0.0) for column in self._columns(candidate)]
-        J = np.array([self._collision_model.tool_jacobian(candidate.tool, at) for at in q])
+        J = self._tools[candidate.tool].jacobians(q)
         moments = [np.cross(slack.points - box.p_TG, slack.directions) for slack in slacks]
         gradients = np.vstack(
             [
@@ -547,7 +547,7 @@ class SegmentPlanner:
             max_tool_acceleration=payload.max_axis_acceleration,
             nearby_distances=nearby_distances,
             column_distances=partial(self._column_distances, candidate) if has_columns else None,
-            tool_jacobian=partial(self._collision_model.tool_jacobian, candidate.tool),
+            tool_jacobians=self._tools[candidate.tool].jacobians,
             tool_axis=self._tools[candidate.tool].axis,
         )
         for optimized in optimize_trajectory(problem):

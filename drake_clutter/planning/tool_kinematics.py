@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.time_parameterization import MAX_JOINT_STEP, linear_joint_path
 from drake_clutter.robots.robot_model import RobotModel, load_robot
+from drake_clutter.robots.serial_chain import SerialChain
 
 Floats = NDArray[np.float64]
 
@@ -170,6 +171,11 @@ class ToolKinematics:
         self._X_FG = X_FG.GetAsMatrix4()
         self._X_BT = X_TB.inverse().GetAsMatrix4()
         self._X_GF = X_FG.inverse().GetAsMatrix4()
+        chain = self.robot.chain
+        fixed = chain.fixed.copy()
+        fixed[0] = self._X_TB @ fixed[0]
+        fixed[-1] = fixed[-1] @ self._X_FG
+        self._chain = SerialChain(fixed, chain.revolute)
 
     def pose(self, q: Floats) -> Floats:
         """Return X_TG, shape (..., 4, 4), at joint positions of shape (..., n)."""
@@ -178,6 +184,14 @@ class ToolKinematics:
     def axis(self, q: Floats) -> Floats:
         """Return the z axis of G in T, shape (..., 3), at positions of shape (..., n)."""
         return self.pose(q)[..., :3, 2]
+
+    def jacobians(self, q: Floats) -> Floats:
+        """Return the spatial Jacobians of G in T, angular rows first. Shape (m, 6, n).
+
+        Args:
+            q: Joint positions. Shape (m, n).
+        """
+        return self._chain.jacobians(q)
 
     def solve_ik(self, X_TG: Floats) -> Floats:
         """Return all inverse kinematics solutions, see `InverseKinematics.solve`.

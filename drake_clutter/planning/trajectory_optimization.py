@@ -18,7 +18,7 @@ collisions and scales it to the limits.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -136,10 +136,10 @@ class TrajectoryOptimizationProblem:
         column_distances: Returns the distances from the columns below a carried object, like
             `nearby_distances`, from joint positions of shape (m, n); they are also imposed at the
             ends of the path, but for its vertical parts. None without an object.
-        tool_jacobian: Returns the spatial Jacobian of the tool, angular rows first, shape (6, n),
-            from joint positions of shape (n,).
-        tool_axis: Returns the z axis of the tool in T, shape (3,), from joint positions of shape
-            (n,).
+        tool_jacobians: Returns the spatial Jacobians of the tool, angular rows first, shape
+            (m, 6, n), from joint positions of shape (m, n).
+        tool_axis: Returns the z axes of the tool in T, shape (m, 3), from joint positions of shape
+            (m, n).
     """
 
     initial_trajectory: Trajectory
@@ -151,7 +151,7 @@ class TrajectoryOptimizationProblem:
     max_tool_acceleration: float
     nearby_distances: Callable[[Floats, Floats], LinearizedDistances]
     column_distances: Callable[[Floats], LinearizedDistances] | None
-    tool_jacobian: Callable[[Floats], Floats]
+    tool_jacobians: Callable[[Floats], Floats]
     tool_axis: Callable[[Floats], Floats]
 
 
@@ -201,12 +201,12 @@ def _shortest_duration(points: Floats, robot: RobotModel) -> float:
         robot: Robot with the limits.
     """
     limits = (robot.velocity_limits, robot.acceleration_limits, robot.jerk_limits)
-    durations = []
+    durations = list[float]()
     for order, limit in enumerate(limits, start=1):
         derivatives = _derivative_matrix(order, robot.num_joints) @ points.ravel()
         ratio = float(np.abs(derivatives.reshape(-1, robot.num_joints) / limit).max())
         durations.append(ratio ** (1.0 / order))
-    return max(*durations)
+    return max(durations)
 
 
 def _is_nearly_optimal(problem: TrajectoryOptimizationProblem, points: Floats) -> bool:
@@ -266,17 +266,19 @@ class _ControlPointSubspaces:
         fixed = [np.zeros((n, 0))] * NUM_FIXED_CONTROL_POINTS
         self._bases = [*fixed, *([np.eye(n)] * num_free), *fixed]
 
-    def constrain(self, index: int, A: Floats, b: Floats) -> None:
-        """Add A q = b for one free control point, which has no constraint yet.
+    def constrain(self, indices: Sequence[int], A: Floats, b: Floats) -> None:
+        """Add A q = b for free control points that have no constraint yet.
 
         Args:
-            index: Index of the control point.
+            indices: Indices of the control points.
             A: Coefficients. Shape (m, n).
             b: Right-hand side. Shape (m,).
         """
-        q = self._points[index]
-        q += np.linalg.lstsq(A, b - A @ q, rcond=None)[0]
-        self._bases[index] = null_space(A, rcond=_RANK_TOLERANCE)
+        basis, inverse = null_space(A, rcond=_RANK_TOLERANCE), np.linalg.pinv(A)
+        for index in indices:
+            q = self._points[index]
+            q += inverse @ (b - A @ q)
+            self._bases[index] = basis
 
     @property
     def offset(self) -> Floats:
@@ -420,7 +422,7 @@ def _limit_constraints(
         )
         constraints.add_distances(kept, q)
     if math.isfinite(problem.max_tool_speed):
-        J = np.array([problem.tool_jacobian(at)[3:] for at in q])
+        J = problem.tool_jacobians(q)[:, 3:]
         velocities = (J @ (_DERIVATIVE_WEIGHTS @ points)[:, :, None])[:, :, 0]
         directions = velocities / np.maximum(np.linalg.norm(velocities, axis=1), 1e-9)[:, None]
         speed = np.full(len(q), problem.max_tool_speed)
@@ -431,7 +433,7 @@ def _limit_constraints(
         )
     if math.isfinite(problem.max_tool_acceleration):
         index = np.repeat(np.arange(0, NUM_COLLISION_SAMPLES, 2), 3)
-        J = np.vstack([problem.tool_jacobian(q[k])[3:] for k in index[::3]])
+        J = problem.tool_jacobians(q[::2])[:, 3:].reshape(-1, n)
         constraints.add_two_sided(
             _directional_matrix(_SECOND_DERIVATIVE_WEIGHTS[index], J),
             np.full(len(index), problem.max_tool_acceleration),
@@ -458,17 +460,16 @@ def _add_vertical_tool_constraints(
     start = NUM_FIXED_CONTROL_POINTS + len(problem.vertical_start)
     end = NUM_CONTROL_POINTS - NUM_FIXED_CONTROL_POINTS - len(problem.vertical_end)
     if rows is not None:
-        for k in range(start, end):
-            subspaces.constrain(k, rows, rows @ points[0])
+        subspaces.constrain(range(start, end), rows, rows @ points[0])
         return
+    axes, jacobians = problem.tool_axis(points), problem.tool_jacobians(points)
     for k in range(start, end):
-        x, y, z = problem.tool_axis(points[k])
-        J_rotation = problem.tool_jacobian(points[k])[:3]
+        (x, y, z), J_rotation = axes[k], jacobians[k, :3]
         # Derivatives of x and y of the tool axis: the first two rows of w x axis.
         tilts = np.array(
             [z * J_rotation[1] - y * J_rotation[2], x * J_rotation[2] - z * J_rotation[0]]
         )
-        subspaces.constrain(k, tilts, tilts @ points[k] - [x, y])
+        subspaces.constrain([k], tilts, tilts @ points[k] - [x, y])
 
 
 def _add_vertical_motion_constraints(
@@ -485,20 +486,21 @@ def _add_vertical_motion_constraints(
         subspaces: Subspaces to which equality constraints are added.
         constraints: Constraints to which inequalities are added.
     """
-    num_fixed = NUM_FIXED_CONTROL_POINTS
     for heights, end, inwards in (
         (problem.vertical_start, 0, 1),
         (problem.vertical_end, NUM_CONTROL_POINTS - 1, -1),
     ):
-        J = problem.tool_jacobian(points[end])
+        if not heights:
+            continue
         q = points[end]
-        for k, min_height in enumerate(heights, start=num_fixed):
-            index = end + inwards * k
-            subspaces.constrain(index, J[:5], J[:5] @ q)
-            is_point = np.eye(NUM_CONTROL_POINTS)[index : index + 1]
-            constraints.add(
-                _directional_matrix(-is_point, J[5:]), np.zeros(1), -J[5:] @ q - min_height
-            )
+        (J,) = problem.tool_jacobians(q[None])
+        indices = end + inwards * (NUM_FIXED_CONTROL_POINTS + np.arange(len(heights)))
+        subspaces.constrain(indices.tolist(), J[:5], J[:5] @ q)
+        constraints.add(
+            _directional_matrix(-np.eye(NUM_CONTROL_POINTS)[indices], J[5:]),
+            np.zeros(len(heights)),
+            -J[5] @ q - np.array(heights),
+        )
 
 
 def _solve_subproblem(
@@ -535,12 +537,13 @@ def _solve_subproblem(
     prog.AddLinearConstraint(N[is_free].tocsc(), lower[is_free], upper[is_free], x[:-1])
     prog.AddBoundingBoxConstraint(_MIN_DURATION**2, (2 * duration + 0.1) ** 2, x[-1:])
     prog.AddLinearCost([1 / duration**2], 0.0, x[-1:])
-    limits = np.tile(problem.robot.acceleration_limits, NUM_CONTROL_POINTS - 2)
-    relative_accelerations = sparse.diags(1 / limits) @ _derivative_matrix(2, n) / duration**2
-    of_y, of_offset = relative_accelerations @ N, relative_accelerations @ p_0
+    limits = np.tile(problem.robot.acceleration_limits, NUM_CONTROL_POINTS - 2) * duration**2
+    # Accelerations of y and of p_0, relative to the limits.
+    D = _derivative_matrix(2, n)
+    of_y, of_offset = (D @ N).toarray() / limits[:, None], (D @ p_0) / limits
     prog.AddQuadraticCost(
-        2 * _SMOOTHNESS_WEIGHT * (of_y.T @ of_y).toarray(),
-        2 * _SMOOTHNESS_WEIGHT * (of_y.T @ of_offset),
+        2 * _SMOOTHNESS_WEIGHT * of_y.T @ of_y,
+        2 * _SMOOTHNESS_WEIGHT * of_y.T @ of_offset,
         x[:-1],
         is_convex=True,
     )

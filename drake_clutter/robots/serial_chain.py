@@ -61,6 +61,16 @@ class SerialChain:
         chain_jacobian(self.joint_frames(q), self.revolute, J)
         return J
 
+    def jacobians(self, q: Floats) -> Floats:
+        """Return the spatial Jacobians of F in B, angular rows first. Shape (m, 6, n).
+
+        Args:
+            q: Joint positions. Shape (m, n).
+        """
+        jacobians = np.empty((len(q), 6, self.num_joints))
+        _jacobians(self.fixed, self.revolute, np.ascontiguousarray(q, float), jacobians)
+        return jacobians
+
     def manipulability(self, q: Floats) -> Floats:
         """Return the manipulability sqrt(det(J J^T)) (Yoshikawa 1985). Shape (...).
 
@@ -120,6 +130,16 @@ def chain_jacobian(frames, revolute, J):  # type: ignore[no-untyped-def]
         else:
             J[0, k] = J[1, k] = J[2, k] = 0.0
             J[3, k], J[4, k], J[5, k] = z0, z1, z2
+
+
+@njit(cache=True)
+def _jacobians(fixed, revolute, q, jacobians):  # type: ignore[no-untyped-def]
+    """Write the Jacobians (m, 6, n) at joint positions q (m, n)."""
+    n = len(revolute)
+    frames, moved = np.empty((n + 1, 4, 4)), np.empty((n, 3, 4))
+    for k in range(len(q)):
+        chain_frames(fixed, revolute, q[k], frames, moved)
+        chain_jacobian(frames, revolute, jacobians[k])
 
 
 @njit(cache=True)
