@@ -153,6 +153,8 @@ def _read_parts(path: Path, where: str, scale: float) -> list[tuple[str, trimesh
                 if faces.min() < 0 or faces.max() >= count:
                     wrong = faces[(faces < 0) | (faces >= count)][0]
                     raise ValueError(f"a triangle has vertex {wrong} of {count}")
+                if np.shape(part.vertices)[1] != 3:
+                    raise ValueError("its vertices have not three coordinates")
                 part = part.copy()
                 part.apply_transform(transform)
                 if path.suffix.lower() in _GLTF_SUFFIXES:

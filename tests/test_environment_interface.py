@@ -1,5 +1,6 @@
 """The environments keep to gymnasium's interface, also for agents that ignore masks."""
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -8,8 +9,10 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import drake_clutter.tasks  # noqa: F401, registers the environments
+from drake_clutter.catalog import load_catalog
 from drake_clutter.files import InputError
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
+from drake_clutter.tasks.environment_interface import index_type
 from drake_clutter.tasks.generation_task import (
     MAX_INFEASIBLE_ACTIONS_PER_NODE,
     ClutterGeneration,
@@ -155,3 +158,35 @@ def test_pictures_show_the_scene() -> None:
     exploration.step(np.argwhere(exploration.observe()["action_mask"])[0])
     assert not np.array_equal(exploration.render(), before)
     assert ClutterExploration().render() is None
+
+
+@pytest.mark.parametrize("make", [ClutterGeneration, ClutterExploration])
+def test_an_episode_starts_with_a_reset(make: type[ClutterGeneration | ClutterExploration]) -> None:
+    environment = make(render_mode="rgb_array")
+    for use in (lambda: environment.step(0), environment.action_masks, environment.render):
+        with pytest.raises(gymnasium.error.ResetNeeded, match=r"call reset\(\) first"):
+            use()
+
+
+@pytest.mark.parametrize("largest", [1, 127, 128, 32767, 32768])
+def test_numbers_of_kinds_are_of_the_smallest_type_that_holds_them(largest: int) -> None:
+    kind = index_type(largest)
+    assert np.iinfo(kind).max >= largest
+    assert kind == np.int8 or np.iinfo(np.dtype(f"i{kind.itemsize // 2}")).max < largest
+
+
+def test_a_set_of_many_classes_has_numbers_above_127() -> None:
+    (box,) = (c for c in load_catalog().object_set("ycb7") if c.name == "sugar_box")
+    classes = [replace(box, name=f"box_{k}") for k in range(130)]
+    environment = ClutterGeneration(classes, GenerationTaskConfig(nodes=4))
+    observation, info = environment.reset(seed=0)
+    while not environment.partial.finished:
+        action = int(np.flatnonzero(info["action_mask"])[-1])
+        observation, *_, info = environment.step(action)
+        assert environment.observation_space.contains(observation)
+    assert observation["node_kind"].max() > 127
+
+
+def test_too_many_objects_are_refused() -> None:
+    with pytest.raises(InputError, match=r"max_objects: 70000; expected 1 to 200"):
+        ClutterExploration(max_objects=70_000)

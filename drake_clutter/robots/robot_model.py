@@ -171,7 +171,7 @@ def _position_limits(spec: RobotSpec, arm: ParsedArm) -> Floats:
         limits = np.array(spec.limits.position)
     for joint, (lower, upper) in zip(arm.joints, limits, strict=True):
         if not np.isfinite([lower, upper]).all():
-            raise _missing_limit("position", joint.name())
+            raise _missing_limit("position", joint.name(), arm)
         if not lower < upper:
             given = f"robot.limits.position: {lower:g}, {upper:g} for joint {joint.name()!r}"
             raise InputError(f"{given}; expected the lower, then the upper limit")
@@ -190,7 +190,7 @@ def _joint_limits(
         return np.array(cell_limits)
     for joint, limit in zip(arm.joints, model_limits, strict=True):
         if not 0 < limit < np.inf:
-            raise _missing_limit(kind, joint.name())
+            raise _missing_limit(kind, joint.name(), arm)
     return np.array(model_limits)
 
 
@@ -201,8 +201,8 @@ def _check_length(field: str, length: int, arm: ParsedArm) -> None:
         raise InputError(f"robot.{field}: {length} values; expected {allowed}")
 
 
-def _missing_limit(kind: str, joint: str) -> InputError:
-    allowed = "a value for each joint, here or in the model file"
+def _missing_limit(kind: str, joint: str, arm: ParsedArm) -> InputError:
+    allowed = f"a value for each joint, here or in {arm.path}"
     return InputError(f"robot.limits.{kind}: is missing for joint {joint!r}; expected {allowed}")
 
 

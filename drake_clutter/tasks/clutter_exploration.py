@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, format_value
+from drake_clutter.limits import MAX_NODES
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.interfaces import Move
 from drake_clutter.scenes.scene import TRAY, Scene, SceneObject
@@ -19,8 +20,10 @@ from drake_clutter.tasks.belief import Decision
 from drake_clutter.tasks.environment_interface import (
     RENDER_METADATA,
     check_index,
+    check_is_reset,
     check_render_mode,
     check_reset_options,
+    index_type,
     render_picture,
 )
 from drake_clutter.tasks.episode import BackendFactory, make_teleport_backend_factory
@@ -93,9 +96,12 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
             render_mode: "rgb_array" for pictures, or None.
 
         Raises:
-            InputError: There is no such file, fidelity or render mode.
+            InputError: There is no such file, fidelity or render mode, or `max_objects` is not
+                allowed.
         """
         self.render_mode = check_render_mode(render_mode)
+        if not 1 <= max_objects <= MAX_NODES:
+            raise InputError(f"max_objects: {max_objects}; expected 1 to {MAX_NODES}")
         if not isinstance(scenes, SceneDataset):
             path = resource_path(DEFAULT_SCENES) if scenes is None else Path(scenes)
             scenes = load_scene_dataset(path, load_catalog())
@@ -112,9 +118,10 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
         self._judge = StaticStabilityJudge(self._config)
         n = self._max_nodes
         e = n * (n - 1) // 2
+        num_kinds = len(self.node_kind_ids)
         box = gymnasium.spaces.Box
         spaces: dict[str, gymnasium.Space[Any]] = {
-            "node_kind": box(0, len(self.node_kind_ids), (n,), np.int8),
+            "node_kind": box(0, num_kinds, (n,), index_type(num_kinds)),
             "node_features": box(
                 -FEATURE_BOUND, FEATURE_BOUND, (n, len(NODE_FEATURES)), np.float32
             ),
@@ -237,15 +244,24 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
             With flat actions, the mask of the pairs. Shape (N * N,). Otherwise the masks of x and
             y, which sb3-contrib samples independently: nodes that are part of an allowed pair, so
             that some of their pairs are not allowed. Shape (2 * N,).
+
+        Raises:
+            gymnasium.error.ResetNeeded: There is no episode.
         """
+        check_is_reset(self, "backend")
         mask = self._action_mask.astype(bool)
         return mask.ravel() if self._flat_actions else np.concatenate([mask.any(1), mask.any(0)])
 
     def render(self) -> Any:
-        """Return the camera's picture as (height, width, 3) uint8; None without a render mode."""
-        return (
-            None if self.render_mode is None else render_picture(self.backend.scene, self._config)
-        )
+        """Return the camera's picture as (height, width, 3) uint8; None without a render mode.
+
+        Raises:
+            gymnasium.error.ResetNeeded: There is no episode.
+        """
+        if self.render_mode is None:
+            return None
+        check_is_reset(self, "backend")
+        return render_picture(self.backend.scene, self._config)
 
     def _node_pair(self, action: Any) -> tuple[int, int]:
         """Return the nodes x and y of an action."""
@@ -262,8 +278,10 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
         """Carry out a move; a masked move changes nothing, but counts as a move.
 
         Raises:
+            gymnasium.error.ResetNeeded: There is no episode.
             InputError: There is no such action.
         """
+        check_is_reset(self, "backend")
         x, y = self._node_pair(action)
         names = self.objects
         if not self._action_mask[x, y]:

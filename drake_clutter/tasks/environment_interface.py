@@ -5,6 +5,7 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
+from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from drake_clutter.config import ClutterConfig
@@ -47,6 +48,25 @@ def check_reset_options(
         if name not in names:
             raise InputError(f"options: {format_value(name)}; expected {expected}")
     return options
+
+
+def check_is_reset(environment: object, attribute: str) -> None:
+    """Check that an environment has an episode.
+
+    Args:
+        environment: The environment.
+        attribute: Name of an attribute that only `reset` sets.
+
+    Raises:
+        gymnasium.error.ResetNeeded: It has none.
+    """
+    if not hasattr(environment, attribute):
+        raise ResetNeeded("there is no episode; call reset() first")
+
+
+def index_type(largest: int) -> np.dtype[Any]:
+    """Return the smallest type of signed integers that holds those up to a number."""
+    return np.min_scalar_type(-largest - 1)
 
 
 def check_index(value: Any, count: int, name: str) -> int:

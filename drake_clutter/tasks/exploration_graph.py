@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from drake_clutter.scenes.interfaces import Move, Observation
 from drake_clutter.scenes.scene import TRAY, SceneObject
+from drake_clutter.tasks.environment_interface import index_type
 
 ExplorationObservation = dict[str, NDArray[Any]]
 """Arrays of `build_exploration_graph` by name."""
@@ -142,7 +143,7 @@ def build_exploration_graph(
     count = len(objects)
     num_nodes = max_nodes or count + 1
     num_edges = num_nodes * (num_nodes - 1) // 2
-    node_kind = np.zeros(num_nodes, np.int8)
+    node_kind = np.zeros(num_nodes, index_type(len(node_kind_ids)))
     node_features = np.zeros((num_nodes, len(NODE_FEATURES)), np.float32)
     edge_links = np.zeros((num_edges, 2), np.int16)
     edge_kind = np.zeros(num_edges, np.int8)

@@ -32,8 +32,10 @@ from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.tasks.environment_interface import (
     RENDER_METADATA,
     check_index,
+    check_is_reset,
     check_render_mode,
     check_reset_options,
+    index_type,
     render_picture,
 )
 from drake_clutter.validation import (
@@ -279,7 +281,7 @@ class PartialScene:
         num_nodes = self._task.nodes
         num_edges = max_edges(num_nodes)
         count = len(self.graph)
-        node_kind = np.zeros(num_nodes, np.int8)
+        node_kind = np.zeros(num_nodes, index_type(len(self._node_kind_ids)))
         node_flags = np.zeros((num_nodes, 4), np.int8)
         position = np.zeros((num_nodes, 3), np.float32)
         node_kind[:count] = [self._node_kind_ids[kind] for kind in self.graph.kinds()]
@@ -293,7 +295,7 @@ class PartialScene:
             if match is not None and column > 0:
                 node_flags[match[pattern.target], column] = 1
         edge_links = np.zeros((num_edges, 2), np.int16)
-        edge_kind = np.zeros(num_edges, np.int8)
+        edge_kind = np.zeros(num_edges, index_type(len(self._edge_kind_ids)))
         e = 0
         for parent, children in self.graph.digraph._adj.items():
             for child, edge in children.items():
@@ -381,15 +383,17 @@ class ClutterGeneration(gymnasium.Env[GenerationObservation, int]):
         self._judge = StaticStabilityJudge(self._config, margin=self.task.contact_margin)
         n = self.task.nodes
         e = max_edges(n)
+        num_node_kinds = len(self.vocabulary.node_kinds)
+        num_edge_kinds = len(self.vocabulary.edge_kinds)
         max_coordinate = max(*self._config.cell.support.size, self._config.layout.max_stack_height)
         box = gymnasium.spaces.Box
         spaces: dict[str, gymnasium.Space[Any]] = {
-            "node_kind": box(0, len(self.vocabulary.node_kinds), (n,), np.int8),
+            "node_kind": box(0, num_node_kinds, (n,), index_type(num_node_kinds)),
             "node_mask": box(0, 1, (n,), np.int8),
             "node_flags": box(0, 1, (n, 4), np.int8),
             "position": box(-max_coordinate, max_coordinate, (n, 3), np.float32),
             "edge_links": box(0, n - 1, (e, 2), np.int16),
-            "edge_kind": box(0, len(self.vocabulary.edge_kinds), (e,), np.int8),
+            "edge_kind": box(0, num_edge_kinds, (e,), index_type(num_edge_kinds)),
             "edge_mask": box(0, 1, (e,), np.int8),
             "remaining_nodes": box(0, n / _REMAINING_NODES_SCALE, (1,), np.float32),
         }
@@ -412,12 +416,24 @@ class ClutterGeneration(gymnasium.Env[GenerationObservation, int]):
         return self.partial.observe(), self._info()
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Return which rules are feasible, as sb3-contrib asks for it. Shape (number of rules,)."""
+        """Return which rules are feasible, as sb3-contrib asks for it. Shape (number of rules,).
+
+        Raises:
+            gymnasium.error.ResetNeeded: There is no episode.
+        """
+        check_is_reset(self, "partial")
         return self.partial.action_mask.astype(bool)
 
     def render(self) -> Any:
-        """Return the camera's picture as (height, width, 3) uint8; None without a render mode."""
-        return None if self.render_mode is None else render_picture(self._scene, self._config)
+        """Return the camera's picture as (height, width, 3) uint8; None without a render mode.
+
+        Raises:
+            gymnasium.error.ResetNeeded: There is no episode.
+        """
+        if self.render_mode is None:
+            return None
+        check_is_reset(self, "partial")
+        return render_picture(self._scene, self._config)
 
     def _info(self) -> dict[str, Any]:
         return {"action_mask": self.partial.action_mask.astype(np.int8)}
@@ -428,8 +444,10 @@ class ClutterGeneration(gymnasium.Env[GenerationObservation, int]):
         """Apply a rule, given by its index.
 
         Raises:
+            gymnasium.error.ResetNeeded: There is no episode.
             InputError: There is no such action.
         """
+        check_is_reset(self, "partial")
         action = check_index(action, len(self.grammar.rules), "action")
         partial = self.partial
         if not partial.action_mask[action]:
