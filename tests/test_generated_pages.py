@@ -1,6 +1,8 @@
 """Generated pages of the documentation: numbers of results files, and references to the code."""
 
 import importlib
+import json
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -172,3 +174,32 @@ def test_environments_page_describes_both_observation_spaces() -> None:
     assert "<!--" not in text
     assert rows_of(text, "`position`")[0][1:4] == ["(25, 3)", "float32", "-0.7 to 0.7"]
     assert "`MultiDiscrete([25 25])`" in text
+
+
+def symmetric_intervals(document: Any) -> set[str]:
+    """Return the names of intervals of means whose center is the mean, other than 1/2."""
+    if isinstance(document, list):
+        return set().union(*map(symmetric_intervals, document))
+    names = set[str]()
+    for key, value in document.items() if isinstance(document, dict) else ():
+        names |= symmetric_intervals(value)
+        base = key.removesuffix("_ci95")
+        mean = document.get(base, document.get(f"{base}_mean"))
+        is_interval = base != key and value and value[0] < value[1] and mean not in (None, 0.5)
+        if is_interval and math.isclose(sum(value) / 2, mean, rel_tol=1e-9):
+            names.add(key)
+    return names
+
+
+def test_intervals_of_the_normal_approximation_are_listed() -> None:
+    """They are symmetric; those of Wilson and Gaffke are not."""
+    files = {*ROOT.glob("training/results/*.json"), *ROOT.glob("benchmarks/results/*.json")}
+    found = {
+        str(path.relative_to(ROOT)): symmetric_intervals(json.loads(path.read_text()))
+        for path in files
+    }
+    assert {file: names for file, names in found.items() if names} == {
+        file: set(names) for file, names in results_intervals.NORMAL_INTERVALS.items()
+    }
+    page = results_intervals.page()
+    assert all(f"| `{file}` |" in page for file in results_intervals.NORMAL_INTERVALS)

@@ -138,6 +138,7 @@ def page() -> str:
     """Return the page."""
     intro = (
         "# Calibration\n\nDifficulty of random scenes compared with the paper, and sensitivity of "
-        "the verdicts ([why the defaults are what they are](../explanation/calibration.md)).\n\n"
+        "the verdicts ([why the defaults are what they are](../explanation/calibration.md)). "
+        "Intervals of means are those of the [normal approximation](intervals.md).\n\n"
     )
     return intro + "\n".join([_scenes(), _settings(), _explored()])

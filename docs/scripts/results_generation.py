@@ -356,7 +356,10 @@ def _maskable_ppo() -> str:
 
 def page() -> str:
     """Return the page."""
-    intro = "# Scene generation\n\nScene generators compared by Drake.\n\n" + table(
+    intro = (
+        "# Scene generation\n\nScene generators compared by Drake. Intervals of means are "
+        "those of the [normal approximation](intervals.md).\n\n"
+    ) + table(
         ["name", "`--agent`", "generator"],
         [[name, f"`{agent}`", text] for name, agent, text in _NAMES],
     )

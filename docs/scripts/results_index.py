@@ -87,7 +87,8 @@ def page() -> str:
     return (
         "# Results\n\nEvery number on these pages is read from a results file in "
         "`training/results/` or `benchmarks/results/`, which names command, seed and "
-        "configuration. [Intervals](intervals.md) are 95 %.\n\n"
+        "configuration. [Intervals](intervals.md) are 95 %; those of mean numbers of hidden "
+        "objects are of the normal approximation.\n\n"
         + table(
             ["page", "content"],
             [[f"[{title}]({file})", content] for file, title, content in PAGES],

@@ -11,6 +11,17 @@ METHODS = {
     "gaffke": "Gaffke",
 }
 """Titles of the columns, by the methods in the results file."""
+NORMAL_INTERVALS = {
+    "training/results/table1.json": ("hidden_ci95",),
+    "training/results/sg_14_110.json": ("hidden_ci95",),
+    "training/results/sg_star_100.json": ("hidden_ci95",),
+    "training/results/first_trainings.json": ("hidden_ci95",),
+    "benchmarks/results/calibration.json": ("hidden_ci95",),
+    "benchmarks/results/calibration_explored.json": ("hidden_ci95",),
+    "training/results/explorers_fast.json": ("found_ci95", "moves_of_successes_ci95"),
+    "training/results/explorers_without_look.json": ("found_ci95", "moves_of_successes_ci95"),
+}
+"""Results files whose intervals of these means are those of the normal approximation."""
 
 
 def page() -> str:
@@ -31,9 +42,19 @@ def page() -> str:
         "For values of 0 and 1 it is the interval of Clopper and Pearson (1934). The bounds are "
         "the node limit for hidden objects, the number of objects for those found, and the move "
         "limit for moves.\n\n"
-        "Means of [generated scenes](generation.md) and of the [calibration](calibration.md) have "
-        "intervals of the normal approximation: the repository does not hold the numbers of "
-        "hidden objects of their 80 to 1000 scenes.\n\n"
+        "## Intervals of the normal approximation\n\n"
+        "The repository does not hold the values of the scenes or episodes of these files, so that "
+        "Gaffke's interval cannot be computed. The intervals of their means are the mean plus and "
+        "minus 1.96 standard errors, and are marked on the pages that show them. Their coverage "
+        "for few values is in the table below.\n\n"
+        + table(
+            ["results file", "intervals"],
+            [
+                [f"`{file}`", ", ".join(f"`{name}`" for name in names)]
+                for file, names in NORMAL_INTERVALS.items()
+            ],
+        )
+        + "\n"
     )
     text += section(
         "Coverage for few values",
