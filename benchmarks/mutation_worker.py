@@ -70,8 +70,11 @@ MEMORY_LIMIT = 16 << 30
 """Address space of a process [bytes]."""
 NOT_REPLACED = "the function cannot be replaced"
 """Failure of a job whose function is not found, or has other enclosed variables."""
-OPTIONS = ("-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist")
-"""Options of pytest."""
+OPTIONS = ("-q", "-x", "--tb=native", "-p", "no:cacheprovider", "-p", "no:xdist")
+"""Options of pytest.
+
+Its own tracebacks cannot show `TooSlow` where Python has no number of a line.
+"""
 IDLE_TIME = 60.0
 """Time after which a process that neither runs nor waits for a processor is ended [s]."""
 

@@ -354,8 +354,8 @@ def _read_piece(path: Path, remedy: str) -> NDArray[np.float64]:
     """Return the corners of a convex piece of a built class [m]. Shape (V, 3)."""
     with reading_file(path, f"a convex piece; {remedy}"):
         corners = np.asarray(trimesh.load_mesh(path).vertices, float)
-        if len(corners) < 4 or not np.isfinite(corners).all():
-            raise ValueError("it has no corners, or some that are not finite")
+        if len(corners) < 4 or corners.shape[1] != 3 or not np.isfinite(corners).all():
+            raise ValueError("it has no solid, or corners that are not finite")
         return corners
 
 
