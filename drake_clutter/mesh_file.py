@@ -24,7 +24,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from drake_clutter.files import InputError, reading_file
+from drake_clutter.files import InputError
 
 Floats = NDArray[np.float64]
 """An array of floats."""
@@ -143,7 +143,7 @@ def _reading_mesh(path: Path, where: str) -> Iterator[None]:
 def _read_parts(path: Path, where: str, scale: float) -> list[tuple[str, trimesh.Trimesh]]:
     """Return the names and meshes of the parts of a file, z up and in meters."""
     parts = []
-    with _reading_mesh(path, where), reading_file(path, "a mesh"):
+    with _reading_mesh(path, where):
         scene = trimesh.load_scene(path, process=False)
         for node in sorted(scene.graph.nodes_geometry):
             transform, geometry = scene.graph[node]

@@ -185,6 +185,27 @@ def test_the_center_of_mass_moves_of_one_object_on_cylinders_at_a_time(
     assert least_stable(objects, pairs, margin=0.005) == expected
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_an_object_balances_while_its_center_of_mass_is_above_the_contact(axis: int) -> None:
+    """The center of mass is 30 mm off the center, the upper edge of the lower box at 115 or 80 mm.
+
+    Two boxes of one size touch from the edge of the upper one to that of the lower one.
+    """
+    lower, upper = BOX, resting("cracker_box", name="upper")
+    shapes = ShapeTable()
+    rows, _ = shapes.rows_and_positions([lower, upper])
+    table = np.concatenate([shapes.arrays.table, shapes.arrays.table[rows[1:]]])
+    lone = len(table) - 1
+    table["first_part"][lone], table["last_part"][lone] = lone, lone + 1
+    table["com"][lone, axis] = 0.03
+    offsets = HALF[axis] + np.array([-0.031, -0.029])
+    positions = np.zeros((4, 3))
+    positions[:, axis] = [*offsets, *(-offsets)]
+    positions[:, 2] = 0.06
+    found = equilibrium.balanced_positions(table, rows[0], lone, positions, 0.0)
+    assert found.tolist() == [True, False, True, True]
+
+
 def test_the_description_of_stacks() -> None:
     """Stacks are described alike wherever they are; objects of stack -1 are left out."""
     shapes = np.array([7, 3, 3, 5, 7, 3])

@@ -35,7 +35,9 @@ from drake_clutter.scenes.placement import has_clear_top, resolve_placement
 from drake_clutter.scenes.scene import TRAY, Pose, SceneObject
 from drake_clutter.simulation.camera_renderer import CameraRenderer
 from drake_clutter.simulation.drake_judge import DrakeJudge
+from drake_clutter.stability.contacts import contact_polygon
 from drake_clutter.stability.ray_caster import RayCaster
+from drake_clutter.stability.shape_table import ShapeTable
 from drake_clutter.stability.static_executor import StaticExecutor
 from drake_clutter.stability.static_judge import StaticStabilityJudge
 
@@ -271,6 +273,46 @@ def test_a_bracket_stands_by_its_center_of_mass(
     assert isinstance(mine, Verdict)
     assert mine.stable is drakes.stable is stable
     assert mine.visible_fractions == pytest.approx(drakes.visible_fractions, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("overlap", "margin", "expected"),
+    [
+        (0.001, 0.0, (-0.021, -0.020)),  # narrower than 2 mm, but the only contact
+        (0.010, 0.002, (-0.027, -0.023)),
+        (0.006, 0.004, (-0.023, -0.023)),  # its center line
+        (0.006, 0.006, None),
+        (-0.001, 0.0, None),
+    ],
+)
+def test_the_contact_with_the_wall_of_a_bracket(
+    overlap: float,
+    margin: float,
+    expected: tuple[float, float] | None,
+    own: dict[str, ObjectClass],
+) -> None:
+    """The wall ends 20 mm left of the center. 1 mm at each side of a wider contact is left out."""
+    bracket = as_made(own["bracket"], (0.0, 0.0), 0.0)
+    box = resting("gelatin_box", xy=(-0.020 - overlap + 0.085 / 2, 0.0), floor=0.080)
+    shapes = ShapeTable()
+    rows, p_T = shapes.rows_and_positions([bracket, box])
+    table = shapes.arrays.table
+    polygon = contact_polygon(table, rows[0], rows[1], p_T[0], p_T[1], margin)
+    if expected is None:
+        assert len(polygon) == 0
+        return
+    assert (polygon[:, 0].min(), polygon[:, 0].max()) == pytest.approx(expected, abs=3e-5)
+
+
+@pytest.mark.parametrize("xy", list(product((-0.25, 0.25), repeat=2)))
+def test_rays_to_a_bracket_do_not_depend_on_earlier_scenes(
+    xy: tuple[float, float], own: dict[str, ObjectClass], config: ClutterConfig
+) -> None:
+    bracket = as_made(own["bracket"], xy, 0.0)
+    cover = resting("cereal_box_large", xy=xy, floor=0.2, name="cover")
+    caster = RayCaster(config.cell.camera)
+    assert caster.visible_fractions([bracket, cover])[bracket.name] < 0.5
+    assert caster.visible_fractions([bracket])[bracket.name] == 1.0
 
 
 @pytest.mark.parametrize(
