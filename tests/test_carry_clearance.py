@@ -135,7 +135,7 @@ def lowest_above_column(plan: PickPlacePlan, moved: SceneObject, X_TO_end: Pose)
 
 @pytest.mark.parametrize("optimize", [False, True])
 def test_a_carried_box_stays_above_what_it_stood_on(optimize: bool) -> None:
-    """The box stays 9.5 mm above it: 5 mm, the sag of the bellows of 2.5 mm, and an error of 2 mm.
+    """The box stays 10 mm above it: 5 mm, the sag of the bellows of 2.5 mm, and an error of 2.5 mm.
 
     The planner does not know what that is. Optimization without this constraint lowers the box
     while it is still above it.
@@ -147,7 +147,7 @@ def test_a_carried_box_stays_above_what_it_stood_on(optimize: bool) -> None:
     assert isinstance(plan, PickPlacePlan)
     carry = next(segment for segment in plan.segments if segment.name == "carry")
     assert (carry.duration < carry.unoptimized_duration) == optimize
-    assert lowest_above_column(plan, moved, X_TO_end) > 0.0095
+    assert lowest_above_column(plan, moved, X_TO_end) > 0.010
 
 
 def test_the_sag_follows_from_load_and_stiffness() -> None:

@@ -261,9 +261,13 @@ class SegmentPlanner:
         }
 
     def contact_distances(self, q: Floats) -> dict[tuple[str, str], float]:
-        """Return the allowed distances to neighbors of the attached object, by names [m]."""
+        """Return the allowed distances to neighbors of the attached object, by names [m].
+
+        They also bound what trajectory optimization keeps: it cannot increase the distances of
+        neighbors of a vertical line.
+        """
         name = self._picked.name
-        reach = self._config.min_distance + max(self._load_distances.values())
+        reach = self._config.min_distance + max(self._load_distances.values()) + OPTIMIZATION_MARGIN
         distances = self._collision_model.distances_below(q, reach)
         of_object = [distance for distance in distances if distance.pair[0] == name]
         # A neighbor may have several geometries: the smallest distance is the last and is kept.
@@ -527,6 +531,8 @@ class SegmentPlanner:
                 for context in (endpoints if is_carry else (arm_context, arm_context))
             ]
             slack = found.distances - np.where(s[found.rows] < 0.5, *required)
+            # Links are as close to each other as the arm is folded, which it is at the ends, too.
+            slack[self._collision_model.is_to_arm(found)] += OPTIMIZATION_MARGIN
             # Distances between neighboring wrist links are constant.
             varies = np.abs(found.gradients).max(axis=1, initial=0.0) > 1e-6
             return LinearizedDistances(found.rows[varies], found.gradients[varies], slack[varies])
