@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydrake.geometry import (
     Box,
     CollisionFilterDeclaration,
+    Convex,
     GeometryId,
     GeometrySet,
     SignedDistancePair,
@@ -81,6 +82,7 @@ class CollisionModel:
         cell: WorkCell,
         objects: Sequence[tuple[str, ObjectClass]],
         occluded: Sequence[OccludedBox] = (),
+        views: Sequence[Floats] = (),
     ) -> None:
         """Build the model.
 
@@ -88,6 +90,8 @@ class CollisionModel:
             cell: Work cell with the arm.
             objects: Name and class of each object.
             occluded: Occluded volumes, which count as obstacles.
+            views: Corners in T of convex volumes that a camera looks through, which count as
+                obstacles [m]. Shapes (m, 3).
         """
         self._robot = load_robot(cell.robot)
         self._tools = cell.gripper.tools
@@ -104,6 +108,14 @@ class CollisionModel:
                 X_TB,
                 Box(*box.size),
                 f"{_OCCLUDED_PREFIX}{k}",
+                CoulombFriction(1.0, 1.0),
+            )
+        for k, corners in enumerate(views):
+            plant.RegisterCollisionGeometry(
+                plant.world_body(),
+                RigidTransform(),
+                Convex(corners.T, f"view_{k}"),
+                f"view_{k}",
                 CoulombFriction(1.0, 1.0),
             )
         plant.Finalize()
@@ -464,6 +476,20 @@ class CollisionModel:
                 moment = (y * nz - z * ny, z * nx - x * nz, x * ny - y * nx)  # p_FC x n
                 gradient[:depth] += (*moment, nx, ny, nz) @ J[:, :depth]
         return gradient
+
+    def lowest_points(self, q: Floats) -> Floats:
+        """Return the height of the lowest point of the robot's moving links [m]. Shape (m,).
+
+        Args:
+            q: Joint positions of the arm. Shape (m, n).
+        """
+        gripper = {self._geometry_ids[shape] for shape in self._gripper_shapes}
+        shapes = [
+            shape
+            for shape, geometry in enumerate(self._geometry_ids)
+            if self._geometry_depths.get(geometry) and geometry not in gripper
+        ]
+        return self._shapes.lowest_points(q, shapes)
 
     def tool_positions(self, tool: str, path: Floats) -> Floats:
         """Return p_TG of a tool along a path [m]. Shape (m, 3).

@@ -361,3 +361,51 @@ def path_distances(  # type: ignore[no-untyped-def]
                     gradients[count, j] = (along if on_A else -along) / distance
             count += 1
     return count
+
+
+@njit(cache=True, nogil=True)
+def lowest_points(fixed, revolute, q, depths, X_JS, kinds, sizes, radii, vertices, starts, shapes):  # type: ignore[no-untyped-def]
+    """Return the height of the lowest point of some moving shapes at each q [m]. Shape (m,).
+
+    Args:
+        fixed: See `path_distances`; as the arguments that follow.
+        revolute: See `path_distances`.
+        q: See `path_distances`.
+        depths: See `path_distances`.
+        X_JS: See `path_distances`.
+        kinds: See `path_distances`.
+        sizes: See `path_distances`.
+        radii: See `path_distances`.
+        vertices: See `path_distances`.
+        starts: See `path_distances`.
+        shapes: Indices of the shapes. Shape (k,).
+    """
+    n = len(revolute)
+    frames = np.empty((n + 1, 4, 4))
+    M, X = np.empty((4, 4)), np.empty((4, 4))
+    down = np.array([0.0, 0.0, -1.0])
+    point = np.empty(3)
+    lowest = np.full(len(q), np.inf)
+    for row in range(len(q)):
+        chain_frames(fixed, revolute, q[row], frames)
+        for shape in shapes:
+            j = depths[shape] - 1
+            M[:] = frames[j]
+            if revolute[j]:
+                c, s = np.cos(q[row, j]), np.sin(q[row, j])
+                M[:3, 0] = frames[j, :3, 0] * c + frames[j, :3, 1] * s
+                M[:3, 1] = frames[j, :3, 1] * c - frames[j, :3, 0] * s
+            else:
+                M[:3, 3] += q[row, j] * frames[j, :3, 2]
+            X[:] = M @ X_JS[shape]
+            _add_support(
+                kinds[shape],
+                sizes[shape],
+                vertices[starts[shape] : starts[shape + 1]],
+                X,
+                1.0,
+                down,
+                point,
+            )
+            lowest[row] = min(lowest[row], point[2] - radii[shape])
+    return lowest

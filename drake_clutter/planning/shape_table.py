@@ -20,7 +20,7 @@ from pydrake.geometry import (
     Sphere,
 )
 
-from drake_clutter.planning.convex_distance import CoreKind, path_distances
+from drake_clutter.planning.convex_distance import CoreKind, lowest_points, path_distances
 from drake_clutter.robots.serial_chain import SerialChain
 
 Floats = NDArray[np.float64]
@@ -199,4 +199,27 @@ class ShapeTable:
         )
         return FoundDistances(
             rows[:count], pairs[found[:count]], distances[:count], gradients[:count]
+        )
+
+    def lowest_points(self, q: Floats, shapes: Sequence[int]) -> Floats:
+        """Return the height in T of the lowest point of moving shapes [m]. Shape (m,).
+
+        Args:
+            q: Joint positions. Shape (m, n).
+            shapes: Indices of the shapes.
+        """
+        return np.asarray(
+            lowest_points(
+                self._fixed,
+                self._chain.revolute,
+                np.ascontiguousarray(q, float),
+                self._depths,
+                self._X_JS,
+                self._kinds,
+                self._sizes,
+                self._radii,
+                self._vertices,
+                self._starts,
+                np.array(shapes, np.int64),
+            )
         )

@@ -1,0 +1,190 @@
+"""Inverse reachability map: which base poses reach given poses of a vertical tool.
+
+The map is built once for a robot with its tool. It answers for a pose of the base in microseconds,
+where the planner takes milliseconds (Zacharias, Borst and Hirzinger 2007, "Capturing robot
+workspace structure: representing robot capabilities"; Vahrenkamp, Asfour and Dillmann 2013, "Robot
+placement based on reachability inversion").
+
+Frames: T is the support, B is the robot's base, G is a tool of the gripper, pointing down.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_clutter.cell.pose_spec import PoseSpec
+from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.compilation import njit
+from drake_clutter.planning.collision_model import CollisionModel
+from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.planning.tool_kinematics import ToolKinematics, downward_pose
+
+Floats = NDArray[np.float64]
+
+SPACING = 0.02
+"""Spacing of the map in radius and height [m]."""
+NUM_YAWS = 24
+"""Number of yaws of the tool relative to the radial direction."""
+_FAR_AWAY = 50.0
+"""Distance of the base from the support while the map is built [m]: nothing but itself is near."""
+_MAX_BRANCHES = 8
+
+
+@dataclass(frozen=True, eq=False)
+class InverseReachabilityMap:
+    """Reachability of a vertical tool over radius, height and yaw relative to the base.
+
+    Attributes:
+        heights: Heights of G in B [m]. Shape (n_z,).
+        branches: Bits of the inverse kinematics branches without self-collision; for robots without
+            branches, bit 0 stands for all. Shape (n_r, n_z, NUM_YAWS).
+        lowest: Height in B of the lowest point of the links on each branch [m]. Shape (n_r, n_z,
+            NUM_YAWS, 8).
+    """
+
+    heights: Floats
+    branches: NDArray[np.uint8]
+    lowest: NDArray[np.float32]
+
+    def find_reachable(self, moves: "MovePoses", bases: Floats, table_height: float) -> Floats:
+        """Return the share of moves that are reachable from each base.
+
+        Args:
+            moves: The moves.
+            bases: x, y, z [m] and yaw [rad] of upright bases in T. Shape (m, 4).
+            table_height: Height of the table in T [m].
+
+        Returns:
+            Whether each move is reachable from each base. Shape (m, k).
+        """
+        return np.asarray(
+            _find_reachable(
+                self.branches,
+                self.lowest,
+                self.heights[0],
+                moves.poses,
+                moves.starts,
+                np.ascontiguousarray(bases, float),
+                table_height + PlannerConfig().min_distance,
+            )
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class MovePoses:
+    """Poses of a vertical tool through which moves go, for each grasp and yaw of each move.
+
+    Attributes:
+        poses: x, y [m] and yaw [rad] at the grasp, then at the place; heights at the grasp, at the
+            place, and in between [m]. Shape (l, 9).
+        starts: Index of the first row of each move, and the number of all. Shape (k + 1,).
+    """
+
+    poses: Floats
+    starts: NDArray[np.int64]
+
+
+@lru_cache(maxsize=8)
+def build_inverse_reachability(cell: WorkCell, tool_name: str) -> InverseReachabilityMap:
+    """Return the inverse reachability map of a robot with a tool.
+
+    Args:
+        cell: Work cell; only robot and gripper count.
+        tool_name: Name of the tool.
+    """
+    base = PoseSpec(translation=(-_FAR_AWAY, 0.0, 2.0))
+    robot_spec = cell.robot.model_copy(update={"base": base})
+    apart = cell.model_copy(update={"robot": robot_spec, "fixtures": ()})
+    tool = ToolKinematics(apart, tool_name)
+    robot = tool.robot
+    model = CollisionModel(apart, ())
+    # Beyond the stretched arm with its tool nothing is reachable.
+    X_FG = cell.gripper.tools[tool_name].X_FG
+    reach = float(np.linalg.norm(robot.chain.fixed[:, :3, 3], axis=1).sum())
+    reach += float(np.linalg.norm(X_FG.translation()))
+    radii = np.arange(0.0, reach, SPACING)
+    heights = np.arange(-reach, reach, SPACING)
+    yaws = np.arange(NUM_YAWS) * (2 * math.pi / NUM_YAWS)
+    has_branches = robot.ur_fit is not None
+    shape = len(radii), len(heights), NUM_YAWS
+    branches = np.zeros(shape, np.uint8)
+    lowest = np.full((*shape, _MAX_BRANCHES), -np.inf, np.float32)
+    p_TB = np.array(base.translation)
+    for i, radius in enumerate(radii.tolist()):
+        # The pose is out of reach where the tool's tip is outside the sphere of the arm.
+        rows = np.flatnonzero(radius**2 + heights**2 < reach**2)
+        poses = np.array(
+            [
+                downward_pose(yaw, p_TB + [radius, 0.0, z])
+                for z in heights[rows].tolist()
+                for yaw in yaws
+            ]
+        )
+        q = robot.unwrap(tool.solve_ik(poses), robot.home)
+        index = np.argwhere(np.isfinite(q[..., 0]))
+        if not len(index):
+            continue
+        solutions = q[index[:, 0], index[:, 1]]
+        blocked = {row for row, _ in model.distances_along(solutions, PlannerConfig().min_distance)}
+        is_free = np.ones(len(index), bool)
+        is_free[[*blocked]] = False
+        low = model.lowest_points(solutions) - p_TB[2]
+        for (pose, branch), height in zip(index[is_free], low[is_free], strict=True):
+            j, yaw = rows[pose // NUM_YAWS], pose % NUM_YAWS
+            bit = branch if has_branches else 0
+            branches[i, j, yaw] |= 1 << bit
+            lowest[i, j, yaw, bit] = max(lowest[i, j, yaw, bit], height)
+    return InverseReachabilityMap(heights, branches, lowest)
+
+
+@njit(cache=True, nogil=True)
+def _find_reachable(branches, lowest, first_height, poses, starts, bases, table):  # type: ignore[no-untyped-def]
+    """Return whether each move is reachable from each base, shape (m, k).
+
+    A move is reachable if one branch reaches the grasp, the place and the two points above them,
+    with the links above the table.
+    """
+    num_radii, num_heights, num_yaws = branches.shape
+    found = np.zeros((len(bases), len(starts) - 1), np.bool_)
+    cells = np.empty((4, 3), np.int64)
+    for b in range(len(bases)):
+        x, y, z, yaw = bases[b, 0], bases[b, 1], bases[b, 2], bases[b, 3]
+        for move in range(len(starts) - 1):
+            for row in range(starts[move], starts[move + 1]):
+                common = 255
+                for end in range(2):
+                    dx = poses[row, 3 * end] - x
+                    dy = poses[row, 3 * end + 1] - y
+                    i = int(np.sqrt(dx * dx + dy * dy) / SPACING + 0.5)
+                    relative = (poses[row, 3 * end + 2] - np.arctan2(dy, dx)) / (2 * np.pi)
+                    k = int(np.floor(relative * num_yaws + 0.5)) % num_yaws
+                    for level in range(2):
+                        height = poses[row, 8] if level else poses[row, 6 + end]
+                        j = int(np.floor((height - z - first_height) / SPACING + 0.5))
+                        if i >= num_radii or j < 0 or j >= num_heights:
+                            common = 0
+                            break
+                        common &= branches[i, j, k]
+                        cells[2 * end + level, 0] = i
+                        cells[2 * end + level, 1] = j
+                        cells[2 * end + level, 2] = k
+                    if common == 0:
+                        break
+                bit = 0
+                while common and not found[b, move]:
+                    if common & 1:
+                        clear = True
+                        for c in range(4):
+                            low = lowest[cells[c, 0], cells[c, 1], cells[c, 2], bit]
+                            if low + z < table:
+                                clear = False
+                        if clear:
+                            found[b, move] = True
+                    common >>= 1
+                    bit += 1
+                if found[b, move]:
+                    break
+    return found

@@ -1,0 +1,222 @@
+"""Summary of a feasibility study: shares of the possible moves, ranking and comparisons.
+
+The moves of one scene are not independent of each other: intervals take the scenes as the sample.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from drake_clutter.feasibility.move_study import PLANNED
+from drake_clutter.feasibility.setups import Setup, UnusableSetup
+from drake_clutter.statistics import ratio_interval, wilson_interval
+
+Row = Mapping[str, Any]
+"""Row of a table: values by column."""
+
+MAX_ALL_PAIRS = 12
+"""Number of setups up to which all pairs are compared; more are compared with the best one."""
+MARGIN_QUANTILES = {"smallest": 0.0, "p05": 0.05, "median": 0.5}
+"""Quantiles of the margins over the planned moves."""
+GROUP_KEYS: dict[str, Callable[[Row], str]] = {
+    "object_class": lambda row: row["object_class"],
+    "resting_side": lambda row: row["resting_side"],
+    "objects_below": lambda row: str(row["num_below"]),
+    "top_height_cm": lambda row: (
+        f"{10 * int(10 * row['pick_top'])} to {10 * int(10 * row['pick_top']) + 10}"
+    ),
+    "pick_from_cm": lambda row: f"x {_bin_of_20_cm(row['pick_x'])}, y {_bin_of_20_cm(row['pick_y'])}",
+    "place_at_cm": lambda row: (
+        f"x {_bin_of_20_cm(row['place_x'])}, y {_bin_of_20_cm(row['place_y'])}"
+    ),
+}
+"""Groups of possible moves in a summary: by name, the function that returns a move's group.
+
+Positions are in the tray frame, heights above its floor.
+"""
+
+
+def _bin_of_20_cm(coordinate: float) -> str:
+    """Return the interval of 20 cm that contains a coordinate in m, as text in cm."""
+    low = 20 * math.floor((coordinate + 0.1) / 0.2) - 10
+    return f"{low} to {low + 20}"
+
+
+def summarize_study(
+    setups: Mapping[str, Setup | UnusableSetup],
+    moves: Sequence[Row],
+    pose_errors: Sequence[Row],
+    scenes: Sequence[str],
+) -> dict[str, Any]:
+    """Return the statistics of each setup, their ranking, and comparisons of two setups.
+
+    Args:
+        setups: Setups by name.
+        moves: Rows of `moves.csv`.
+        pose_errors: Rows of `pose_errors.csv`.
+        scenes: Names of the scenes.
+    """
+    by_setup = {name: [row for row in moves if row["setup"] == name] for name in setups}
+    errors = {name: [row for row in pose_errors if row["setup"] == name] for name in setups}
+    summaries = [
+        _summarize_setup(setup, by_setup[name], errors[name]) for name, setup in setups.items()
+    ]
+    ranking = [s["name"] for s in sorted(summaries, key=_rank) if s["possible"]]
+    if len(ranking) <= MAX_ALL_PAIRS:
+        pairs = list(combinations(ranking, 2))
+    else:
+        pairs = [(ranking[0], other) for other in ranking[1:]]
+    return {
+        "scenes": len(scenes),
+        "setups": summaries,
+        "ranking": ranking,
+        "comparisons": [_compare(a, b, by_setup[a], by_setup[b]) for a, b in pairs],
+    }
+
+
+def _rank(summary: Row) -> tuple[float, float]:
+    """Return the sorting key of a setup: most of the possible moves, then shortest cycles."""
+    cycle = summary["cycle_s"]["median"]
+    return -(summary["share"] or 0.0), math.inf if cycle is None else cycle
+
+
+def share_interval(
+    counts: Iterable[tuple[int, int]], lowest: int = 0
+) -> tuple[float, float] | None:
+    """Return the 95 % interval of a share, with the scenes as the sample.
+
+    It is Gaffke's interval of a ratio of means, see `ratio_interval`: as if one more scene, as
+    large as the largest, had the lowest or the highest count.
+
+    Args:
+        counts: Count and number of possible moves of each scene.
+        lowest: Sign of the lowest count of a scene as a fraction of its moves: 0 for shares, -1 for
+            differences.
+
+    Returns:
+        The interval; None without possible moves.
+    """
+    pairs = [(count, total) for count, total in counts if total]
+    if not pairs:
+        return None
+    most = max(total for _, total in pairs)
+    numerators, denominators = zip(*pairs, strict=True)
+    return ratio_interval(numerators, denominators, (lowest * most, most), (most, most))
+
+
+def _counts_by_scene(moves: Sequence[Row]) -> list[tuple[int, int]]:
+    """Return the numbers of planned and of possible moves of each scene."""
+    possible = Counter(row["scene"] for row in moves if row["possible"])
+    planned = Counter(row["scene"] for row in moves if row["result"] == PLANNED)
+    return [(planned[scene], total) for scene, total in possible.items()]
+
+
+def _summarize_setup(
+    setup: Setup | UnusableSetup, moves: Sequence[Row], pose_errors: Sequence[Row]
+) -> dict[str, Any]:
+    """Return the statistics of one setup from its rows."""
+    possible = [row for row in moves if row["possible"]]
+    planned = [row for row in possible if row["result"] == PLANNED]
+    return {
+        "name": setup.name,
+        "unusable": setup.reason if isinstance(setup, UnusableSetup) else None,
+        "home": None
+        if isinstance(setup, UnusableSetup)
+        else {"q": list(setup.home.q), "is_given": setup.home.is_given},
+        "legal": len(moves),
+        "possible": len(possible),
+        "planned": len(planned),
+        "share": len(planned) / len(possible) if possible else None,
+        "share_ci95": share_interval(_counts_by_scene(moves)),
+        "impossible": _count_results(row for row in moves if not row["possible"]),
+        "failures": _count_results(row for row in possible if row["result"] != PLANNED),
+        "groups": {
+            group: {
+                value: {"possible": count, "planned": sum(key(row) == value for row in planned)}
+                for value, count in sorted(Counter(map(key, possible)).items())
+            }
+            for group, key in GROUP_KEYS.items()
+        },
+        "cycle_s": _quantiles(planned, "cycle_s", {"median": 0.5, "p95": 0.95}),
+        "planning_s": _quantiles(
+            possible, "planning_s", {"median": 0.5, "p95": 0.95, "p99": 0.99}
+        ),
+        "margins": {
+            "clearance": _quantiles(planned, "clearance", MARGIN_QUANTILES),
+            "joint_margin": _quantiles(planned, "joint_margin", MARGIN_QUANTILES),
+            "singular_value": _quantiles(planned, "singular_value", MARGIN_QUANTILES),
+            "manipulability": _quantiles(planned, "manipulability", MARGIN_QUANTILES),
+            **{
+                name: _quantiles(planned, name, {"median": 0.5, "p95": 0.95, "largest": 1.0})
+                for name in ("torque_share", "load_share")
+            },
+        },
+        "pose_errors": [
+            _summarize_pose_errors(kind, size, rows)
+            for (kind, size), rows in _group_pose_errors(pose_errors).items()
+        ],
+    }
+
+
+def _count_results(moves: Iterable[Row]) -> dict[str, int]:
+    return dict(Counter(row["result"] for row in moves).most_common())
+
+
+def _quantiles(
+    moves: Sequence[Row], column: str, quantiles: Mapping[str, float]
+) -> dict[str, float | None]:
+    """Return quantiles of a column; distances that are not computed count as infinite."""
+    values = [math.inf if row[column] is None else row[column] for row in moves]
+    found = np.quantile(values, [*quantiles.values()], method="lower") if values else ()
+    finite = [float(value) if math.isfinite(value) else None for value in found]
+    return dict(zip(quantiles, finite, strict=True)) if finite else dict.fromkeys(quantiles)
+
+
+def _group_pose_errors(rows: Sequence[Row]) -> dict[tuple[str, float], list[Row]]:
+    groups: dict[tuple[str, float], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row["kind"], row["size"]), []).append(row)
+    return dict(sorted(groups.items()))
+
+
+def _summarize_pose_errors(kind: str, size: float, rows: Sequence[Row]) -> dict[str, Any]:
+    placed = sum(row["result"] == "placed" for row in rows)
+    return {
+        "kind": kind,
+        "size": size,
+        "moves": len(rows),
+        "placed": placed,
+        "placed_ci95": wilson_interval(placed, len(rows)),
+        "results": _count_results(rows),
+    }
+
+
+def _compare(first: str, second: str, moves_a: Sequence[Row], moves_b: Sequence[Row]) -> Row:
+    """Return the comparison of two setups over the moves that are possible in both."""
+
+    def by_move(moves: Sequence[Row]) -> dict[tuple[str, str, str], bool]:
+        return {
+            (row["scene"], row["pick"], row["place"]): row["result"] == PLANNED
+            for row in moves
+            if row["possible"]
+        }
+
+    a, b = by_move(moves_a), by_move(moves_b)
+    scenes: dict[str, list[int]] = {}
+    for key in a.keys() & b.keys():
+        scenes.setdefault(key[0], []).append(a[key] - b[key])
+    differences = [(sum(values), len(values)) for _, values in sorted(scenes.items())]
+    total = sum(count for _, count in differences)
+    return {
+        "first": first,
+        "second": second,
+        "possible_in_both": total,
+        "planned_by_first_only": sum(a[key] and not b[key] for key in a.keys() & b.keys()),
+        "planned_by_second_only": sum(b[key] and not a[key] for key in a.keys() & b.keys()),
+        "difference": sum(d for d, _ in differences) / total if total else None,
+        "difference_ci95": share_interval(differences, lowest=-1),
+    }
