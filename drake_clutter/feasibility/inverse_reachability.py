@@ -9,18 +9,27 @@ Frames: T is the support, B is the robot's base, G is a tool of the gripper, poi
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_clutter.cell.gripper import Grasp
 from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.compilation import njit
 from drake_clutter.planning.collision_model import CollisionModel
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.planning.tool_kinematics import ToolKinematics, downward_pose
+from drake_clutter.planning.tool_kinematics import (
+    ToolKinematics,
+    downward_pose,
+    is_vertical,
+    retreat_along_axis,
+)
+from drake_clutter.scenes.scene import Pose, SceneObject
+from drake_clutter.simulation.scene_plant import rigid_transform
 
 Floats = NDArray[np.float64]
 
@@ -49,8 +58,10 @@ class InverseReachabilityMap:
     branches: NDArray[np.uint8]
     lowest: NDArray[np.float32]
 
-    def find_reachable(self, moves: "MovePoses", bases: Floats, table_height: float) -> Floats:
-        """Return the share of moves that are reachable from each base.
+    def find_reachable(
+        self, moves: "MovePoses", bases: Floats, table_height: float
+    ) -> NDArray[np.bool_]:
+        """Return which moves are reachable from each base.
 
         Args:
             moves: The moves.
@@ -85,6 +96,50 @@ class MovePoses:
 
     poses: Floats
     starts: NDArray[np.int64]
+
+    @staticmethod
+    def join(moves: Sequence[Floats]) -> "MovePoses":
+        """Return the poses of moves from those of each, see `find_move_poses`."""
+        starts = np.cumsum([0, *map(len, moves)])
+        return MovePoses(np.vstack([np.empty((0, 9)), *moves]), starts)
+
+
+def find_move_poses(
+    picked: SceneObject, X_TO_place: Pose, grasps: Iterable[Grasp], config: PlannerConfig
+) -> Floats:
+    """Return the poses of a vertical tool through which a move goes.
+
+    Args:
+        picked: Object to pick.
+        X_TO_place: Pose at which it is released.
+        grasps: Its grasps; those with a tilted tool are left out.
+        config: Parameters of the planner.
+
+    Returns:
+        Rows of `MovePoses`. Shape (l, 9).
+    """
+    bottoms = picked.bounds_T[0][2], replace(picked, X_TO=X_TO_place).bounds_T[0][2]
+    transfer_bottom = max(bottoms) + config.lift_height
+    X_moved = (
+        rigid_transform(X_TO_place).GetAsMatrix4()
+        @ rigid_transform(picked.X_TO).inverse().GetAsMatrix4()
+    )
+    rows = []
+    for grasp in grasps:
+        X_pick = retreat_along_axis(grasp.X_TG.GetAsMatrix4(), config.lip_gap)
+        X_place = X_moved @ X_pick
+        if not (is_vertical(X_pick) and is_vertical(X_place)):
+            continue
+        number = grasp.num_angles or config.num_yaws
+        turns = np.arange(number) * (2 * math.pi / number)
+        heights = X_pick[2, 3], X_place[2, 3], X_pick[2, 3] - bottoms[0] + transfer_bottom
+        ends = [
+            (X[0, 3], X[1, 3], math.atan2(X[1, 0], X[0, 0]) + turn)
+            for turn in turns
+            for X in (X_pick, X_place)
+        ]
+        rows += [(*pick, *place, *heights) for pick, place in zip(ends[::2], ends[1::2], strict=True)]
+    return np.array(rows).reshape(-1, 9)
 
 
 @lru_cache(maxsize=8)

@@ -40,6 +40,10 @@ IMPOSSIBLE_RESULTS = frozenset(
         PlanningFailureReason.CARRIES_OTHERS,
         PlanningFailureReason.NO_SEAL,
         PlanningFailureReason.NO_OPPOSED_FACES,
+        PlanningFailureReason.PLACE_IN_COLLISION,
+        PlanningFailureReason.PLACE_TILTED,
+        PlanningFailureReason.PLACE_UNSUPPORTED,
+        PlanningFailureReason.PLACE_OFF_BALANCE,
     )
 )
 """Results that no arm changes: no room, objects on top, or no tool that holds the object."""

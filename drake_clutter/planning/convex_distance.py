@@ -382,22 +382,23 @@ def lowest_points(fixed, revolute, q, depths, X_JS, kinds, sizes, radii, vertice
     """
     n = len(revolute)
     frames = np.empty((n + 1, 4, 4))
-    M, X = np.empty((4, 4)), np.empty((4, 4))
+    moved = np.empty((n, 3, 4))
+    X = np.empty((3, 4))
     down = np.array([0.0, 0.0, -1.0])
     point = np.empty(3)
     lowest = np.full(len(q), np.inf)
     for row in range(len(q)):
-        chain_frames(fixed, revolute, q[row], frames)
+        chain_frames(fixed, revolute, q[row], frames, moved)
         for shape in shapes:
-            j = depths[shape] - 1
-            M[:] = frames[j]
-            if revolute[j]:
-                c, s = np.cos(q[row, j]), np.sin(q[row, j])
-                M[:3, 0] = frames[j, :3, 0] * c + frames[j, :3, 1] * s
-                M[:3, 1] = frames[j, :3, 1] * c - frames[j, :3, 0] * s
-            else:
-                M[:3, 3] += q[row, j] * frames[j, :3, 2]
-            X[:] = M @ X_JS[shape]
+            M = moved[depths[shape] - 1]
+            for i in range(3):
+                for j in range(4):
+                    X[i, j] = (
+                        M[i, 0] * X_JS[shape, 0, j]
+                        + M[i, 1] * X_JS[shape, 1, j]
+                        + M[i, 2] * X_JS[shape, 2, j]
+                    )
+                X[i, 3] += M[i, 3]
             _add_support(
                 kinds[shape],
                 sizes[shape],

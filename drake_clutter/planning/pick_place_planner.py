@@ -525,6 +525,10 @@ class PickPlacePlanner:
         tops = [*model.fixture_tops, *(box.top_height for box in occluded)]
         return PickPlaceSearch(self.cell, self.config, self.tools, model, state, goal, tops)
 
+    def grasps(self, scene_object: SceneObject) -> Sequence[Grasp] | PlanningFailure:
+        """Return the feasible grasps of an object, closest to its center of mass first."""
+        return self._grasps(scene_object)
+
     def can_grasp(self, scene_object: SceneObject) -> bool:
         """Return whether the gripper has a grasp on an object that holds its weight."""
         return not isinstance(self._grasps(scene_object), PlanningFailure)
