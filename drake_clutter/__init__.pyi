@@ -93,7 +93,7 @@ from .station.trajectory_file import (
     read_trajectories as read_trajectories,
     write_trajectories as write_trajectories,
 )
-from .tasks.feasibility_study import FeasibilityStudy as FeasibilityStudy
+from .feasibility.move_study import FeasibilityStudy as FeasibilityStudy
 
 # The closed loop.
 from .systems.closed_loop import ClosedLoop as ClosedLoop

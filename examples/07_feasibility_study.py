@@ -10,7 +10,6 @@ from multiprocessing import get_context
 from drake_clutter import (
     ClutterConfig,
     FeasibilityStudy,
-    PlannerConfig,
     load_catalog,
     load_scene_dataset,
     resource_path,
@@ -30,7 +29,7 @@ def count_results(base_x: float, index: int) -> Counter[str]:
 
     scenes = load_scene_dataset(resource_path("training/scenes/sg_star_10.json"), load_catalog())
     scene = scenes.settled_scene(index, scenes.grammar, config)
-    study = FeasibilityStudy(f"base {base_x}", config, PlannerConfig(optimize=False), 0)
+    study = FeasibilityStudy(f"base {base_x}", config, 0)
     return Counter(row.result for row in study.plan_all_moves(f"{index:04d}", index, scene))
 
 

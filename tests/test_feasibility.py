@@ -11,6 +11,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from conftest import DEFAULT_CELL, ONE_CUP, cell_with, resting, rng, scene_of
+from drake_clutter.planning.reachability import ReachabilityAnalysis, score_base_positions
+from drake_clutter.tasks.feasibility_study import (
+    MOVE_RECORD_FIELDS,
+    PLANNED,
+    FeasibilityStudy,
+    objects_below,
+    resting_side,
+)
 from typer.testing import CliRunner
 
 from drake_clutter.cell.work_cell import WorkCell
@@ -26,7 +34,6 @@ from drake_clutter.planning.pick_place_plan import (
 )
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.planning.reachability import ReachabilityAnalysis, score_base_positions
 from drake_clutter.planning.tool_kinematics import downward_pose
 from drake_clutter.reports import feasibility_report
 from drake_clutter.resources import resource_path
@@ -35,13 +42,6 @@ from drake_clutter.scenes.interfaces import Verdict
 from drake_clutter.scenes.scene import Pose
 from drake_clutter.scenes.scene_file import save_scene
 from drake_clutter.tasks import feasibility_study
-from drake_clutter.tasks.feasibility_study import (
-    MOVE_RECORD_FIELDS,
-    PLANNED,
-    FeasibilityStudy,
-    objects_below,
-    resting_side,
-)
 
 SCENE = scene_of(
     resting("pudding_box"),

@@ -21,7 +21,7 @@ FLOORS = {
     4: {"perception", "planning"},
     5: {"tasks"},
     6: {"station"},
-    7: {"agents"},
+    7: {"agents", "feasibility"},
     8: {"systems"},
     9: {"__main__", "cli", "commands", "installation_check", "reports"},
 }

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from conftest import DEFAULT_CELL, resting, scene_of
+from drake_clutter.tasks.feasibility_study import MOVE_RECORD_FIELDS
 from test_floors import FLOORS
 
 from drake_clutter import ClutterConfig, run_episode
@@ -16,7 +17,6 @@ from drake_clutter.scenes.scene_file import scene_to_dict
 from drake_clutter.station import trajectory_file
 from drake_clutter.tasks.episode import make_teleport_backend_factory
 from drake_clutter.tasks.exploration_task import TerminationReason
-from drake_clutter.tasks.feasibility_study import MOVE_RECORD_FIELDS
 
 DOCS = Path(__file__).parents[1] / "docs"
 

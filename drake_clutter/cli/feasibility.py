@@ -16,12 +16,14 @@ from drake_clutter.cli.options import (
     ConfigOption,
     JsonOption,
     OutOption,
+    RayOption,
     SeedOption,
     SetOption,
     WorkersOption,
 )
 from drake_clutter.cli.output import print_result, progress_bar
 from drake_clutter.files import InputError
+from drake_clutter.limits import MAX_COUNT
 
 POSE_METAVAR = "X,Y,Z,YAW"
 
@@ -69,33 +71,74 @@ def feasibility(
             help="YAML file with the cell fields that differ from the first cell. May be repeated.",
         ),
     ] = None,
+    sweep: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FIELD=FIRST:LAST:STEP",
+            help="Study every value of a cell field, such as `robot.base.z=0:0.6:0.1` or "
+            "`gripper.extension=0.1,0.2`. May be repeated: every combination is studied.",
+        ),
+    ] = None,
+    search: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FIELD=FIRST:LAST:STEP",
+            help="Search the best values of cell fields, such as `robot.base.x=-1:-0.4:0.05`, by "
+            "an inverse reachability map, and study the best ones. May be repeated.",
+        ),
+    ] = None,
     targets: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Suction cup poses to check: YAML list of `{name, translation, quaternion}`.",
+            help="Tool poses to check: YAML list of `{name, translation, quaternion}`.",
         ),
     ] = None,
+    maps: Annotated[
+        bool, typer.Option(help="Draw maps of reachability for several tilts of the tool.")
+    ] = True,
+    noise: Annotated[
+        int,
+        typer.Option(
+            metavar="N",
+            min=0,
+            max=MAX_COUNT,
+            help="Simulate N moves of each scene and setup, planned from poses, calibrations and "
+            "masses with errors.",
+        ),
+    ] = 0,
+    agent: Annotated[
+        str | None,
+        typer.Option(
+            help="Search every scene to the end with an exploration policy, see `explore`."
+        ),
+    ] = None,
+    simulate: Annotated[
+        bool, typer.Option("--simulate", help="Simulate the motions of these searches.")
+    ] = False,
     seed: SeedOption = 0,
     workers: WorkersOption = 1,
+    ray: RayOption = None,
     catalog: CatalogOption = None,
     config_file: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Plan every legal move of scenes with one or several arms.
+    """Find out which moves of scenes one or several arms can do, and where to put them.
 
-    Writes CSV tables, `summary.json` and the web page `report.html`. An interrupted study resumes
+    Writes tables, `summary.json` and the web page `report.html`. An interrupted study resumes
     when the same command is given again.
     """
+    from drake_clutter.agents.explorers import make_policy_factory
     from drake_clutter.commands.feasibility_job import (
-        REPORT_FILE,
         FeasibilityJob,
         check_unique_names,
         collect_scene_files,
         make_setups,
         read_targets,
-        run_feasibility_study,
     )
+    from drake_clutter.commands.feasibility_run import REPORT_FILE, run_feasibility_study
+    from drake_clutter.feasibility.base_search import make_base_grids
+    from drake_clutter.feasibility.setups import SetupRequest, parse_sweep, sweep_setups
     from drake_clutter.reports.terminal_text import describe_feasibility
 
     reject_support_settings(settings)
@@ -114,13 +157,33 @@ def feasibility(
         next(iter(cells.values()), config.cell),
     )
     if cells:
-        setups = cells | {name: cell for name, cell in setups.items() if name != "default"}
-    target_poses = read_targets(targets) if targets else ()
-    job = FeasibilityJob(files, setups, target_poses, seed, config, catalog)
+        given = {name: SetupRequest(cell, keep_home=True) for name, cell in cells.items()}
+        setups = given | {name: setup for name, setup in setups.items() if name != "default"}
+    setups = sweep_setups(setups, [parse_sweep("--sweep", text) for text in sweep or []])
+    searches = tuple(parse_sweep("--search", text) for text in search or [])
+    if searches:
+        make_base_grids(next(iter(setups.values())).cell, searches)
+    if agent is not None:
+        make_policy_factory(agent, config)
+    elif simulate:
+        raise InputError("--simulate: is for searches; expected --agent, too")
+    job = FeasibilityJob(
+        scenes=files,
+        setups=setups,
+        searches=searches,
+        targets=read_targets(targets) if targets else (),
+        draws_maps=maps,
+        noisy_moves=noise,
+        agent=agent,
+        simulate=simulate,
+        seed=seed,
+        config=config,
+        catalog_folder=catalog,
+    )
 
     def progress(parts: Iterable[Any], num_done: int, total: int) -> Iterable[Any]:
         return progress_bar("parts of the study", parts, num_done, total)
 
-    summary = run_feasibility_study(job, out, workers, progress)
+    summary = run_feasibility_study(job, out, workers, progress, ray)
     rows = describe_feasibility(summary) | {"report": str(out / REPORT_FILE)}
     print_result(summary, rows, as_json, f"{out}")

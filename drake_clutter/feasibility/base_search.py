@@ -5,7 +5,7 @@ Frames: T is the support, B is the robot's base.
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.feasibility.inverse_reachability import (
+    InverseReachabilityMap,
     MovePoses,
-    build_inverse_reachability,
     find_move_poses,
 )
 from drake_clutter.feasibility.move_study import LegalMove
@@ -71,6 +71,8 @@ def make_base_grids(cell: WorkCell, searches: Sequence[Sweep]) -> tuple[BaseGrid
     Raises:
         InputError: There are too many bases, none, or a field or a value is not allowed.
     """
+    if any(cell.robot.base.rpy_deg[:2]):
+        raise input_error("--search", "the base is tilted; expected an upright one")
     count = math.prod(len(search.values) for search in searches)
     if count > MAX_BASES:
         raise input_error("--search", f"{count} bases; expected at most {MAX_BASES}")
@@ -103,12 +105,16 @@ def _without_overlaps(grid: BaseGrid) -> BaseGrid:
 
 
 def count_reachable_moves(
-    grid: BaseGrid, scene: Scene, moves: Sequence[LegalMove]
+    grid: BaseGrid,
+    maps: Mapping[str, InverseReachabilityMap],
+    scene: Scene,
+    moves: Sequence[LegalMove],
 ) -> tuple[NDArray[np.int64], int]:
     """Return how many of the possible moves of a scene each base reaches, by the map.
 
     Args:
         grid: The bases.
+        maps: Inverse reachability of the robot with each tool, by name.
         scene: The scene.
         moves: Its legal moves.
 
@@ -136,9 +142,8 @@ def count_reachable_moves(
             rows.append(find_move_poses(picked, place, of_tool, config))
     is_reachable = np.zeros((len(grid.bases), num_possible), bool)
     for name, rows in poses.items():
-        reach = build_inverse_reachability(cell, name)
         joined = MovePoses.join(rows)
-        is_reachable |= reach.find_reachable(joined, grid.bases, cell.table_height)
+        is_reachable |= maps[name].find_reachable(joined, grid.bases, cell.table_height)
     return is_reachable.sum(axis=1), num_possible
 
 

@@ -151,17 +151,19 @@ class HomeSearch:
         rest = np.zeros_like(q)
         moved = arm_dynamics(self._cell, Payload()).motion(q, rest, rest, np.zeros((1, 3)))
         q = q[(np.abs(moved.gravity_torques) < robot.torque_limits / 2).all(axis=1)]
-        threshold = PlannerConfig().min_distance
-        arm = self._collision_model.arm_names
+        found = self._collision_model.distances_along(q, CLEARANCE)
+        is_to_arm = self._collision_model.is_to_arm(found)
+        is_close = ~is_to_arm | (found.distances < PlannerConfig().min_distance)
         is_clear = np.ones(len(q), bool)
-        for row, found in self._collision_model.distances_along(q, CLEARANCE):
-            is_of_arm = found.pair[1] in arm
-            is_clear[row] &= is_of_arm and found.distance >= threshold
-        return q[is_clear]
+        is_clear[found.rows[is_close]] = False
+        return np.asarray(q[is_clear])
 
     def _is_connected(self, home: Floats, q: Floats) -> bool:
         """Return whether a straight line in joint space is clear of the cell."""
         path = linear_joint_path(home, self._robot.unwrap(q, home))
         threshold = PlannerConfig().min_distance
         found = self._collision_model.distances_along(path, threshold)
-        return all("view_0" in distance.pair for _, distance in found)
+        pairs = {
+            self._collision_model.signed_distance(found, k).pair for k in range(len(found.rows))
+        }
+        return all("view_0" in pair for pair in pairs)

@@ -11,7 +11,7 @@ Frames: T is the support, B is the robot's base, G is a tool of the gripper, poi
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from drake_clutter.cell.gripper import Grasp
 from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.compilation import njit
+from drake_clutter.files import atomic_write
 from drake_clutter.planning.collision_model import CollisionModel
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import (
@@ -65,7 +66,8 @@ class InverseReachabilityMap:
 
         Args:
             moves: The moves.
-            bases: x, y, z [m] and yaw [rad] of upright bases in T. Shape (m, 4).
+            bases: x, y, z of upright bases in T [m]; the yaw does not count, as long as the first
+                joint turns freely. Shape (m, 3) or more columns.
             table_height: Height of the table in T [m].
 
         Returns:
@@ -138,11 +140,24 @@ def find_move_poses(
             for turn in turns
             for X in (X_pick, X_place)
         ]
-        rows += [(*pick, *place, *heights) for pick, place in zip(ends[::2], ends[1::2], strict=True)]
+        rows += [
+            (*pick, *place, *heights) for pick, place in zip(ends[::2], ends[1::2], strict=True)
+        ]
     return np.array(rows).reshape(-1, 9)
 
 
-@lru_cache(maxsize=8)
+def load_inverse_reachability(path: Path) -> InverseReachabilityMap:
+    """Return a map that `save_inverse_reachability` wrote."""
+    with np.load(path) as arrays:
+        return InverseReachabilityMap(**{name: arrays[name] for name in arrays.files})
+
+
+def save_inverse_reachability(path: Path, reachability: InverseReachabilityMap) -> None:
+    """Write a map as a NumPy archive."""
+    with atomic_write(path) as temporary:
+        np.savez_compressed(temporary, **vars(reachability))
+
+
 def build_inverse_reachability(cell: WorkCell, tool_name: str) -> InverseReachabilityMap:
     """Return the inverse reachability map of a robot with a tool.
 
@@ -173,7 +188,7 @@ def build_inverse_reachability(cell: WorkCell, tool_name: str) -> InverseReachab
         rows = np.flatnonzero(radius**2 + heights**2 < reach**2)
         poses = np.array(
             [
-                downward_pose(yaw, p_TB + [radius, 0.0, z])
+                downward_pose(yaw, p_TB + np.array([radius, 0.0, z]))
                 for z in heights[rows].tolist()
                 for yaw in yaws
             ]
@@ -183,9 +198,8 @@ def build_inverse_reachability(cell: WorkCell, tool_name: str) -> InverseReachab
         if not len(index):
             continue
         solutions = q[index[:, 0], index[:, 1]]
-        blocked = {row for row, _ in model.distances_along(solutions, PlannerConfig().min_distance)}
         is_free = np.ones(len(index), bool)
-        is_free[[*blocked]] = False
+        is_free[model.distances_along(solutions, PlannerConfig().min_distance).rows] = False
         low = model.lowest_points(solutions) - p_TB[2]
         for (pose, branch), height in zip(index[is_free], low[is_free], strict=True):
             j, yaw = rows[pose // NUM_YAWS], pose % NUM_YAWS
@@ -206,7 +220,7 @@ def _find_reachable(branches, lowest, first_height, poses, starts, bases, table)
     found = np.zeros((len(bases), len(starts) - 1), np.bool_)
     cells = np.empty((4, 3), np.int64)
     for b in range(len(bases)):
-        x, y, z, yaw = bases[b, 0], bases[b, 1], bases[b, 2], bases[b, 3]
+        x, y, z = bases[b, 0], bases[b, 1], bases[b, 2]
         for move in range(len(starts) - 1):
             for row in range(starts[move], starts[move + 1]):
                 common = 255

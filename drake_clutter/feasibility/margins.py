@@ -12,12 +12,8 @@ from numpy.typing import NDArray
 
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.planning.motion_limits import (
-    LimitKind,
-    MotionLimits,
-    MotionSamples,
-    sample_spline,
-)
+from drake_clutter.planning.cubic_spline import CubicSpline, MotionSamples
+from drake_clutter.planning.motion_limits import LimitKind, MotionLimits, sample_spline
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.robots.robot_model import RobotModel
@@ -83,12 +79,15 @@ def compute_margins(plan: PickPlacePlan, cell: WorkCell, tool: ToolKinematics) -
     configurations = []
     for segment in plan.segments:
         limits = MotionLimits(cell, plan.payload if segment.name == "carry" else Payload())
-        motion = sample_spline(segment.trajectory, SAMPLE_PERIOD)
+        motion = sample_spline(CubicSpline.from_trajectory(segment.trajectory), SAMPLE_PERIOD)
         lower, upper = robot.position_limits.T
-        joint_margin = min(joint_margin, float(np.minimum(motion.q - lower, upper - motion.q).min()))
+        joint_margin = min(
+            joint_margin, float(np.minimum(motion.q - lower, upper - motion.q).min())
+        )
         torque_share = max(torque_share, _torque_share(limits, motion))
         if segment.name == "carry":
-            load_share = float(limits.ratios(motion)[LimitKind.LOAD].max())
+            ratios = limits.ratios(motion)
+            load_share = float(ratios.values[:, ratios.kinds == LimitKind.LOAD].max())
         configurations.append(motion.q)
     J = scaled_jacobians(robot, np.vstack(configurations))
     singular_values = np.linalg.svd(J, compute_uv=False)

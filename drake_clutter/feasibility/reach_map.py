@@ -139,12 +139,12 @@ class ReachabilityAnalysis:
 
     def _find_obstacles(self, q: Floats) -> list[str]:
         """Return the closest bodies that are closer than the planner allows, or "", at each q."""
-        min_distance = PlannerConfig().min_distance
-        closest = [math.inf] * len(q)
+        found = self._collision_model.distances_along(q, PlannerConfig().min_distance)
         names = [""] * len(q)
-        for row, found in self._collision_model.distances_along(q, min_distance):
-            if found.distance < closest[row]:
-                closest[row], names[row] = found.distance, " and ".join(found.pair)
+        # The closest pair of each configuration is the last that is written.
+        for k in np.argsort(-found.distances, kind="stable").tolist():
+            pair = self._collision_model.signed_distance(found, k).pair
+            names[found.rows[k]] = " and ".join(pair)
         return names
 
     def compute_map(

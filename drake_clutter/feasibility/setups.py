@@ -70,8 +70,12 @@ class UnusableSetup:
     reason: str
 
 
-def parse_sweep(text: str) -> Sweep:
+def parse_sweep(option: str, text: str) -> Sweep:
     """Return the sweep of `FIELD=FIRST:LAST:STEP` or `FIELD=VALUE,VALUE,...`.
+
+    Args:
+        option: Option that the text was given to.
+        text: The text.
 
     Raises:
         InputError: The text has another form, or too many values.
@@ -81,29 +85,33 @@ def parse_sweep(text: str) -> Sweep:
         if not field:
             raise ValueError
         if ":" not in values:
-            return _checked_sweep(text, Sweep(field, tuple(map(float, values.split(",")))))
+            return _checked_sweep(option, text, Sweep(field, tuple(map(float, values.split(",")))))
         first, last, step = map(float, values.split(":"))
         count = (last - first) / step
     except (ValueError, ZeroDivisionError):
-        raise _sweep_error(text) from None
+        raise _sweep_error(option, text) from None
     if not 0 <= count < math.inf:
-        raise _sweep_error(text)
+        raise _sweep_error(option, text)
     if count >= MAX_SETUPS:
-        raise input_error(f"--sweep {text}", f"{count + 1:.0f} values; expected at most {MAX_SETUPS}")
+        raise input_error(
+            f"{option} {text}", f"{count + 1:.0f} values; expected at most {MAX_SETUPS}"
+        )
     # The last value is reached where rounding puts it just beyond.
     steps = np.arange(math.floor(count + 1e-9) + 1)
-    return _checked_sweep(text, Sweep(field, tuple((first + step * steps).round(9).tolist())))
+    return _checked_sweep(
+        option, text, Sweep(field, tuple((first + step * steps).round(9).tolist()))
+    )
 
 
-def _checked_sweep(text: str, sweep: Sweep) -> Sweep:
+def _checked_sweep(option: str, text: str, sweep: Sweep) -> Sweep:
     if not all(map(math.isfinite, sweep.values)) or len({*sweep.values}) < len(sweep.values):
-        raise _sweep_error(text)
+        raise _sweep_error(option, text)
     return sweep
 
 
-def _sweep_error(text: str) -> InputError:
+def _sweep_error(option: str, text: str) -> InputError:
     allowed = "FIELD=FIRST:LAST:STEP, or FIELD=VALUE,VALUE,... with different values"
-    return input_error(f"--sweep {text}", f"expected {allowed}")
+    return input_error(f"{option} {text}", f"expected {allowed}")
 
 
 def sweep_setups(

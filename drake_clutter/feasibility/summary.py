@@ -13,7 +13,9 @@ import numpy as np
 
 from drake_clutter.feasibility.move_study import PLANNED
 from drake_clutter.feasibility.setups import Setup, UnusableSetup
+from drake_clutter.scenes.interfaces import MoveResult
 from drake_clutter.statistics import ratio_interval, wilson_interval
+from drake_clutter.tasks.exploration_task import TerminationReason
 
 Row = Mapping[str, Any]
 """Row of a table: values by column."""
@@ -29,7 +31,9 @@ GROUP_KEYS: dict[str, Callable[[Row], str]] = {
     "top_height_cm": lambda row: (
         f"{10 * int(10 * row['pick_top'])} to {10 * int(10 * row['pick_top']) + 10}"
     ),
-    "pick_from_cm": lambda row: f"x {_bin_of_20_cm(row['pick_x'])}, y {_bin_of_20_cm(row['pick_y'])}",
+    "pick_from_cm": lambda row: (
+        f"x {_bin_of_20_cm(row['pick_x'])}, y {_bin_of_20_cm(row['pick_y'])}"
+    ),
     "place_at_cm": lambda row: (
         f"x {_bin_of_20_cm(row['place_x'])}, y {_bin_of_20_cm(row['place_y'])}"
     ),
@@ -49,7 +53,8 @@ def _bin_of_20_cm(coordinate: float) -> str:
 def summarize_study(
     setups: Mapping[str, Setup | UnusableSetup],
     moves: Sequence[Row],
-    pose_errors: Sequence[Row],
+    noise: Sequence[Row],
+    sequences: Sequence[Row],
     scenes: Sequence[str],
 ) -> dict[str, Any]:
     """Return the statistics of each setup, their ranking, and comparisons of two setups.
@@ -57,13 +62,21 @@ def summarize_study(
     Args:
         setups: Setups by name.
         moves: Rows of `moves.csv`.
-        pose_errors: Rows of `pose_errors.csv`.
+        noise: Rows of `noise.csv`.
+        sequences: Rows of `sequences.csv`.
         scenes: Names of the scenes.
     """
-    by_setup = {name: [row for row in moves if row["setup"] == name] for name in setups}
-    errors = {name: [row for row in pose_errors if row["setup"] == name] for name in setups}
+
+    def by_setup(rows: Sequence[Row]) -> dict[str, list[Row]]:
+        groups: dict[str, list[Row]] = {name: [] for name in setups}
+        for row in rows:
+            groups[row["setup"]].append(row)
+        return groups
+
+    moves_of, noise_of, sequences_of = map(by_setup, (moves, noise, sequences))
     summaries = [
-        _summarize_setup(setup, by_setup[name], errors[name]) for name, setup in setups.items()
+        _summarize_setup(setup, moves_of[name], noise_of[name], sequences_of[name])
+        for name, setup in setups.items()
     ]
     ranking = [s["name"] for s in sorted(summaries, key=_rank) if s["possible"]]
     if len(ranking) <= MAX_ALL_PAIRS:
@@ -74,7 +87,7 @@ def summarize_study(
         "scenes": len(scenes),
         "setups": summaries,
         "ranking": ranking,
-        "comparisons": [_compare(a, b, by_setup[a], by_setup[b]) for a, b in pairs],
+        "comparisons": [_compare(a, b, moves_of[a], moves_of[b]) for a, b in pairs],
     }
 
 
@@ -116,7 +129,10 @@ def _counts_by_scene(moves: Sequence[Row]) -> list[tuple[int, int]]:
 
 
 def _summarize_setup(
-    setup: Setup | UnusableSetup, moves: Sequence[Row], pose_errors: Sequence[Row]
+    setup: Setup | UnusableSetup,
+    moves: Sequence[Row],
+    noise: Sequence[Row],
+    sequences: Sequence[Row],
 ) -> dict[str, Any]:
     """Return the statistics of one setup from its rows."""
     possible = [row for row in moves if row["possible"]]
@@ -142,9 +158,7 @@ def _summarize_setup(
             for group, key in GROUP_KEYS.items()
         },
         "cycle_s": _quantiles(planned, "cycle_s", {"median": 0.5, "p95": 0.95}),
-        "planning_s": _quantiles(
-            possible, "planning_s", {"median": 0.5, "p95": 0.95, "p99": 0.99}
-        ),
+        "planning_s": _quantiles(possible, "planning_s", {"median": 0.5, "p95": 0.95, "p99": 0.99}),
         "margins": {
             "clearance": _quantiles(planned, "clearance", MARGIN_QUANTILES),
             "joint_margin": _quantiles(planned, "joint_margin", MARGIN_QUANTILES),
@@ -155,10 +169,10 @@ def _summarize_setup(
                 for name in ("torque_share", "load_share")
             },
         },
-        "pose_errors": [
-            _summarize_pose_errors(kind, size, rows)
-            for (kind, size), rows in _group_pose_errors(pose_errors).items()
+        "noise": [
+            _summarize_noise(kind, size, rows) for (kind, size), rows in _group_noise(noise).items()
         ],
+        "sequences": _summarize_sequences(sequences) if sequences else None,
     }
 
 
@@ -176,15 +190,15 @@ def _quantiles(
     return dict(zip(quantiles, finite, strict=True)) if finite else dict.fromkeys(quantiles)
 
 
-def _group_pose_errors(rows: Sequence[Row]) -> dict[tuple[str, float], list[Row]]:
+def _group_noise(rows: Sequence[Row]) -> dict[tuple[str, float], list[Row]]:
     groups: dict[tuple[str, float], list[Row]] = {}
     for row in rows:
         groups.setdefault((row["kind"], row["size"]), []).append(row)
     return dict(sorted(groups.items()))
 
 
-def _summarize_pose_errors(kind: str, size: float, rows: Sequence[Row]) -> dict[str, Any]:
-    placed = sum(row["result"] == "placed" for row in rows)
+def _summarize_noise(kind: str, size: float, rows: Sequence[Row]) -> dict[str, Any]:
+    placed = sum(row["result"] == MoveResult.PLACED.value for row in rows)
     return {
         "kind": kind,
         "size": size,
@@ -192,6 +206,20 @@ def _summarize_pose_errors(kind: str, size: float, rows: Sequence[Row]) -> dict[
         "placed": placed,
         "placed_ci95": wilson_interval(placed, len(rows)),
         "results": _count_results(rows),
+    }
+
+
+def _summarize_sequences(rows: Sequence[Row]) -> dict[str, Any]:
+    solved = [row for row in rows if row["ended"] == TerminationReason.ALL_FOUND.value]
+    return {
+        "scenes": len(rows),
+        "solved": len(solved),
+        "solved_share": len(solved) / len(rows),
+        "solved_ci95": wilson_interval(len(solved), len(rows)),
+        "minutes_of_solved": _quantiles(solved, "minutes", {"median": 0.5, "p95": 0.95}),
+        "moves_of_solved": _quantiles(solved, "moves", {"median": 0.5, "p95": 0.95}),
+        "ended": dict(Counter(row["ended"] for row in rows).most_common()),
+        "not_planned": sum(row["not_planned"] for row in rows),
     }
 
 

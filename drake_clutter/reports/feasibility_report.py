@@ -3,140 +3,225 @@
 import base64
 import io
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
-import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
-from PIL import Image
-from pydrake.math import RigidTransform
 
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.files import write_text
-from drake_clutter.planning.pick_place_plan import PickPlacePlan
-from drake_clutter.planning.pick_place_planner import PickPlacePlanner
-from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.planning.tool_kinematics import ToolKinematics
-from drake_clutter.reports.filmstrip import render_filmstrip
-from drake_clutter.reports.scene_images import Annotations, SceneRenderer
-from drake_clutter.scenes.interfaces import ArmState, MotionSample
-from drake_clutter.scenes.scene import Pose, Scene
-from drake_clutter.simulation.scene_plant import pose_from_transform
-from drake_clutter.statistics import wilson_interval
-from drake_clutter.tasks.feasibility_study import PLANNED
+from drake_clutter.reports.feasibility_cases import render_case, select_cases
+from drake_clutter.reports.feasibility_figures import (
+    PLOT_STYLE,
+    Row,
+    Rows,
+    plot_base_search,
+    plot_by_object,
+    plot_by_position,
+    plot_failures,
+    plot_noise,
+    plot_ranking,
+    plot_reachability,
+)
+from drake_clutter.reports.scene_images import SceneRenderer
+from drake_clutter.scenes.scene import Scene
 
-Rows = Sequence[Mapping[str, Any]]
-"""Rows of a table: values by column."""
-
-CASES_PER_KIND = 3
-"""Number of moves shown of each kind of extreme case."""
-_PLOT_STYLE: dict[Any, Any] = {
-    "font.size": 15,
-    "axes.grid": True,
-    "grid.alpha": 0.35,
-    "figure.constrained_layout.use": True,
-}
+MAX_PANELS = 10
+"""Number of setups, the best of the ranking, that are shown one by one."""
+MAX_LEGEND = 6
+"""Number of setups, the best of the ranking, that share the axes of a figure."""
+MAX_SETUPS_WITH_CASES = 4
+"""Number of setups, the best of the ranking, whose worst cases are drawn."""
 _CSS = """body{font:16px/1.5 system-ui,"DejaVu Sans",sans-serif;max-width:1120px;margin:2em auto;
 padding:0 1em;color:#1f2630}
 h1,h2{line-height:1.2}.scroll{overflow-x:auto}table{border-collapse:collapse;margin:1em 0}
 td,th{border:1px solid #cdd2d9;padding:.3em .6em;text-align:left;vertical-align:top}
 img{max-width:100%;margin:.5em 0}figure{margin:1em 0}
 .case{border-top:1px solid #cdd2d9;padding:.5em 0}"""
-_REACHABLE_LABEL = "reachable fraction of the cup poses"
-_MANIPULABILITY_LABEL = "manipulability [m$^3$]"
-_PLANNED_LABEL = "fraction of the moves planned"
+
+
+@dataclass(frozen=True)
+class StudyResults:
+    """Results of a study.
+
+    Attributes:
+        setups: Work cells of the setups that could be studied, by name.
+        moves: Rows of `moves.csv`.
+        noise: Rows of `noise.csv`.
+        sequences: Rows of `sequences.csv`.
+        maps: Reachability maps by setup.
+        bases: Rows of `bases.csv`.
+        targets: Rows of `targets.csv`.
+        summary: Document of `summary.json`.
+    """
+
+    setups: Mapping[str, WorkCell]
+    moves: Rows
+    noise: Rows
+    sequences: Rows
+    maps: Mapping[str, Row]
+    bases: Rows
+    targets: Rows
+    summary: Row
 
 
 def write_feasibility_report(
-    path: Path,
-    setups: Mapping[str, WorkCell],
-    moves: Rows,
-    pose_errors: Rows,
-    reachability_maps: Mapping[str, Mapping[str, Any]],
-    bases: Rows,
-    targets: Rows,
-    summary: Mapping[str, Any],
-    load_scene: Callable[[str], Scene],
+    path: Path, results: StudyResults, load_scene: Callable[[str], Scene]
 ) -> None:
     """Write the page of a feasibility study.
 
     Args:
         path: HTML file.
-        setups: Work cells by name.
-        moves: Rows of `moves.csv`.
-        pose_errors: Rows of `pose_errors.csv`.
-        reachability_maps: Reachability map of each setup, by its fields.
-        bases: Rows of `bases.csv`.
-        targets: Rows of `targets.csv`.
-        summary: Document of `summary.json`.
+        results: Results of the study.
         load_scene: Returns the scene of a name at its settled poses.
     """
-    plt.rcParams.update(_PLOT_STYLE)
-    first_setup = next(iter(setups.values()))
-    parts = [
-        f"<h1>Kinematic feasibility: {summary['scenes']} scenes, {len(setups)} setups, "
-        f"{len(moves)} planning problems</h1>",
-        _setups_table(setups, summary),
-    ]
-    if summary["unstable_scenes"]:
-        excluded = escape(", ".join(summary["unstable_scenes"]))
-        parts.append(f"<p>Excluded, because they are unstable: {excluded}.</p>")
-    if len(setups) > 1:
-        rows = [(pair, str(count)) for pair, count in summary["planned_by"].items()]
-        parts.append("<h2>Moves planned by one setup and not by another</h2>")
-        parts.append(_table(("planned by", "number of moves"), rows))
-    if moves:
-        names = list(setups)
-        parts += [
-            _figure(
-                "Results of all legal moves (labels: number of moves)", _plot_results(moves, names)
-            ),
-            _figure(
-                "Fraction of legal moves planned, by picked object (bars: 95 % CI)",
-                _plot_by_object(moves, names),
-            ),
-            _figure(
-                "Fraction of legal moves planned, by pick position (labels: number of moves)",
-                _plot_by_pick_position(moves, setups),
-            ),
-        ]
-    for setup, reachability_map in reachability_maps.items():
-        title = f"{setup}: poses reachable with the cup pointing down, in the empty cell"
-        parts.append(_figure(title, _plot_reachability(reachability_map)))
-    parts.append(
-        _figure(
-            "Base positions, at the height and yaw of the first setup",
-            _plot_base_positions(bases, first_setup),
-        )
-    )
-    if pose_errors:
-        parts.append(
-            _figure(
-                "Plans from erroneous object poses, valid for the true poses (bars: 95 % CI)",
-                _plot_pose_errors(pose_errors),
-            )
-        )
-    if targets:
-        parts.append(_targets_table(targets))
-    if moves:
-        parts.append(
-            "<h2>Extreme cases</h2><p>The move from above and, if it is planned, the arm at the "
-            "grasp, halfway to the place, and at the place.</p>"
-        )
-        parts += _extreme_cases_html(moves, setups, load_scene)
+    with plt.rc_context(PLOT_STYLE):
+        parts = [*_summary_parts(results), *_figure_parts(results)]
+    parts += _case_parts(results, load_scene)
     page = (
         '<!doctype html><html lang="en"><meta charset="utf-8"><title>Kinematic feasibility</title>'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<style>{_CSS}</style><body>{''.join(parts)}</body></html>"
     )
-    page += '<meta name="viewport" content="width=device-width, initial-scale=1">'
-    page += f"<style>{_CSS}</style><body>{''.join(parts)}"
-    write_text(path, page + "</body></html>")
+    write_text(path, page)
+
+
+def answer_sentences(summary: Row) -> list[str]:
+    """Return three sentences that answer the question of a study.
+
+    Args:
+        summary: Document of `summary.json`.
+    """
+    by_name = {setup["name"]: setup for setup in summary["setups"]}
+    if not summary["ranking"]:
+        return [f"None of the {len(by_name)} setups has a possible move."]
+    best = by_name[summary["ranking"][0]]
+    low, high = best["share_ci95"]
+    sentences = [
+        f"{best['name']} does {best['planned']} of the {best['possible']} moves that "
+        f"{_number(summary['scenes'], 'scene')} and its tools allow: {100 * best['share']:.1f} % "
+        f"(95 % interval over scenes {100 * low:.1f} to {100 * high:.1f} %)."
+    ]
+    failures = Counter(best["failures"])
+    if failures:
+        reason, count = failures.most_common(1)[0]
+        failed = best["possible"] - best["planned"]
+        sentences.append(f"Of its {_number(failed, 'failure')}, {count} are \u201c{reason}\u201d.")
+    else:
+        sentences.append("No possible move fails.")
+    cycle = best["cycle_s"]["median"]
+    time = "" if cycle is None else f"A move takes {cycle:.1f} s at the median"
+    if len(summary["ranking"]) == 1:
+        return [*sentences, *([f"{time}."] if time else [])]
+    second = summary["ranking"][1]
+    comparison = next(
+        c for c in summary["comparisons"] if {c["first"], c["second"]} == {best["name"], second}
+    )
+    difference = 100 * comparison["difference"] * (1 if comparison["first"] == best["name"] else -1)
+    bounds = [100 * value for value in comparison["difference_ci95"]]
+    decided = "" if bounds[0] <= 0 <= bounds[1] else "not "
+    sentences.append(
+        f"{time + '; ' if time else ''}{second} is next, {difference:.1f} points behind: the data "
+        f"are {decided}compatible with no difference."
+    )
+    return sentences
+
+
+def _summary_parts(results: StudyResults) -> Iterable[str]:
+    summary = results.summary
+    count = len(summary["setups"])
+    yield (
+        f"<h1>Kinematic feasibility: {_number(summary['scenes'], 'scene')}, "
+        f"{_number(count, 'setup')}</h1>"
+    )
+    yield f"<p><b>{escape(' '.join(answer_sentences(summary)))}</b></p>"
+    yield (
+        "<p>A move is <i>possible</i> if the scene and the tools allow it: the object has nothing "
+        "on top, a tool holds it, and there is a free place. All shares are of the possible moves. "
+        "Intervals take the scenes as the sample.</p>"
+    )
+    yield _setups_table(results)
+    if summary["unstable_scenes"]:
+        excluded = escape(", ".join(summary["unstable_scenes"]))
+        yield f"<p>Excluded, because they are unstable: {excluded}.</p>"
+    if summary["comparisons"]:
+        yield "<h2>Differences between setups</h2>"
+        yield _comparisons_table(summary["comparisons"])
+    yield "<h2>Margins of the planned moves</h2>"
+    yield _margins_table(summary)
+    if results.sequences:
+        yield "<h2>Searches of whole scenes</h2>"
+        yield _sequences_table(summary)
+    if results.targets:
+        yield f"<h2>Target poses</h2>{_targets_table(results.targets)}"
+
+
+def _figure_parts(results: StudyResults) -> Iterable[str]:
+    summary, setups, moves = results.summary, results.setups, results.moves
+    ranking = summary["ranking"]
+    if not ranking:
+        return
+    panels, legend = ranking[:MAX_PANELS], ranking[:MAX_LEGEND]
+    shown = "" if len(ranking) <= MAX_LEGEND else f" (the best {MAX_LEGEND} setups)"
+    if len(ranking) > 1:
+        yield _figure("Ranking", plot_ranking(summary))
+    if any(setup["failures"] for setup in summary["setups"]):
+        yield _figure(f"Reasons of failures{shown}", plot_failures(moves, legend))
+    yield _figure(
+        f"Planned share by picked object{shown}",
+        plot_by_object(moves, legend),
+    )
+    for end in ("pick", "place"):
+        yield _figure(
+            f"Planned share by position of the {end} (labels: number of moves)",
+            plot_by_position(moves, setups, end, panels),
+        )
+    if results.maps:
+        names = [name for name in panels if name in results.maps]
+        yield _figure(
+            "Reachability of the first tool in the empty cell, mean over "
+            f"{len(results.maps[names[0]]['heights'])} heights",
+            plot_reachability(results.maps, names),
+        )
+    if results.bases:
+        finalists = [cell for name, cell in setups.items() if "robot.base" in name]
+        yield _figure(
+            "Search of the base (stars: compared by the planner)",
+            plot_base_search(results.bases, finalists),
+        )
+    if results.noise:
+        yield _figure(
+            "Moves planned from erroneous data, simulated to the end (bars: 95 % interval)",
+            plot_noise(summary),
+        )
+
+
+def _case_parts(results: StudyResults, load_scene: Callable[[str], Scene]) -> Iterable[str]:
+    """Return pictures of the worst cases of the best setups."""
+    ranking = results.summary["ranking"][:MAX_SETUPS_WITH_CASES]
+    if not ranking:
+        return
+    yield (
+        "<h2>Worst cases</h2><p>The move from above and, if it is planned, the arm at the grasp, "
+        "halfway to the place, and at the place.</p>"
+    )
+    renderer = SceneRenderer()
+    for name in ranking:
+        yield f"<h3>{escape(name)}</h3>"
+        for kind, row in select_cases([row for row in results.moves if row["setup"] == name]):
+            title = f"{row['scene']}: {row['pick']} to {row['place']}"
+            scene = load_scene(row["scene"])
+            detail, images = render_case(row, scene, results.setups[name], renderer)
+            embedded = "".join(_embedded_image(image, title) for image in images)
+            text = f"{escape(title)}; {escape(detail)}"
+            yield f'<div class="case"><p><b>{escape(kind)}.</b> {text}</p>{embedded}</div>'
+
+
+def _number(count: int, noun: str) -> str:
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -148,36 +233,142 @@ def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return f'<div class="scroll"><table><tr>{head}</tr>{body}</table></div>'
 
 
-def _setups_table(setups: Mapping[str, WorkCell], summary: Mapping[str, Any]) -> str:
+def _format(value: float | None, digits: int, unit: str = "") -> str:
+    return "-" if value is None else f"{value:.{digits}f}{unit}"
+
+
+def _interval(bounds: Sequence[float] | None, digits: int = 3) -> str:
+    return "" if bounds is None else f" ({bounds[0]:.{digits}f} to {bounds[1]:.{digits}f})"
+
+
+def _setups_table(results: StudyResults) -> str:
     rows = []
-    for name, cell in setups.items():
-        statistics = summary["setups"][name]
-        low, high = statistics["planned_ci95"]
-        fraction = statistics["planned_fraction"]
-        duration = statistics["median_motion_duration_s"]
-        times = statistics["planning_time_s"]
+    summary = results.summary
+    by_name = {setup["name"]: setup for setup in summary["setups"]}
+    order = [*summary["ranking"], *(name for name in by_name if name not in summary["ranking"])]
+    for place, name in enumerate(order, start=1):
+        setup = by_name[name]
+        if setup["unusable"] is not None:
+            rows.append(("", name, setup["unusable"], *[""] * 7))
+            continue
+        cell = results.setups[name]
         base = (*cell.robot.base.translation, cell.robot.base.rpy_deg[2])
+        impossible = ", ".join(f"{n} {reason}" for reason, n in setup["impossible"].items())
         rows.append(
             (
+                str(place) if name in summary["ranking"] else "",
                 name,
-                ", ".join(f"{value:g}" for value in base),
-                cell.gripper.description,
+                ", ".join(f"{value:.4g}" for value in base),
                 f"{cell.robot.payload:g} kg",
-                f"{statistics['planned']} of {statistics['moves']}",
-                "-" if fraction is None else f"{fraction:.3f} ({low:.3f} to {high:.3f})",
-                "-" if duration is None else f"{duration:.2f} s",
-                f"{1000 * times['p50']:.0f} ms, {1000 * times['p95']:.0f} ms",
+                "given" if setup["home"]["is_given"] else "searched",
+                f"{setup['planned']} of {setup['possible']}",
+                _format(setup["share"], 3) + _interval(setup["share_ci95"]),
+                impossible or "none",
+                _format(setup["cycle_s"]["median"], 2, " s"),
+                _format(setup["planning_s"]["median"], 3, " s"),
+            )
+        )
+    columns = (
+        "rank",
+        "setup",
+        "base x, y, z [m], yaw [deg]",
+        "payload",
+        "home",
+        "planned of possible",
+        "share (95 % interval)",
+        "legal, but impossible",
+        "cycle time, median",
+        "planning time, median",
+    )
+    return _table(columns, rows)
+
+
+def _comparisons_table(comparisons: Rows) -> str:
+    rows = [
+        (
+            row["first"],
+            row["second"],
+            str(row["possible_in_both"]),
+            str(row["planned_by_first_only"]),
+            str(row["planned_by_second_only"]),
+            _format(row["difference"], 3) + _interval(row["difference_ci95"]),
+        )
+        for row in comparisons
+    ]
+    columns = (
+        "first",
+        "second",
+        "possible in both",
+        "planned by the first only",
+        "by the second only",
+        "difference of the shares (95 % interval)",
+    )
+    return _table(columns, rows)
+
+
+def _margins_table(summary: Row) -> str:
+    rows = []
+    for setup in summary["setups"]:
+        if not setup["planned"]:
+            continue
+        margins = setup["margins"]
+
+        def pair(name: str, digits: int, scale: float, found: Row = margins) -> str:
+            low, middle = found[name]["p05"], found[name]["median"]
+            return ", ".join(_format(v if v is None else scale * v, digits) for v in (low, middle))
+
+        def shares(name: str, found: Row = margins) -> str:
+            values = (found[name][key] for key in ("median", "p95", "largest"))
+            return ", ".join(_format(None if v is None else 100 * v, 0, " %") for v in values)
+
+        rows.append(
+            (
+                setup["name"],
+                pair("clearance", 0, 1000),
+                pair("joint_margin", 2, 1),
+                pair("singular_value", 3, 1),
+                pair("manipulability", 4, 1),
+                shares("torque_share"),
+                shares("load_share"),
             )
         )
     columns = (
         "setup",
-        "base x, y, z [m], yaw [deg]",
-        "gripper",
-        "payload",
-        "moves planned",
-        "fraction planned (95 % CI)",
-        "median motion duration",
-        "planning time (p50, p95)",
+        "clearance [mm]: 5 %, median (-: above 30)",
+        "to joint limits [rad]: 5 %, median",
+        "smallest singular value: 5 %, median",
+        "manipulability: 5 %, median",
+        "torque of its limit: median, 95 %, largest",
+        "acceleration of what the tool holds: median, 95 %, largest",
+    )
+    return _table(columns, rows)
+
+
+def _sequences_table(summary: Row) -> str:
+    rows = []
+    for setup in summary["setups"]:
+        found = setup["sequences"]
+        if found is None:
+            continue
+        rows.append(
+            (
+                setup["name"],
+                f"{found['solved']} of {found['scenes']}",
+                _format(found["solved_share"], 2) + _interval(found["solved_ci95"], 2),
+                _format(found["minutes_of_solved"]["median"], 2, " min"),
+                _format(found["moves_of_solved"]["median"], 0),
+                str(found["not_planned"]),
+                ", ".join(f"{n} {ended}" for ended, n in found["ended"].items()),
+            )
+        )
+    columns = (
+        "setup",
+        "scenes searched to the end",
+        "share (95 % interval)",
+        "robot time of these, median",
+        "moves of these, median",
+        "moves without a plan",
+        "ends",
     )
     return _table(columns, rows)
 
@@ -187,20 +378,22 @@ def _targets_table(targets: Rows) -> str:
         (
             target["setup"],
             target["target"],
+            "yes" if target["reachable"] else "no",
             str(target["num_solutions"]),
-            f"{target['manipulability']:.3f}",
-            target["blocking_bodies"] or ("" if target["num_solutions"] else "out of reach"),
+            _format(target["singular_value"], 3),
+            target["obstacles"] or ("" if target["reachable"] else "out of reach"),
         )
         for target in targets
     ]
     columns = (
         "setup",
         "target pose",
-        "collision-free IK solutions",
-        "manipulability [m\N{SUPERSCRIPT THREE}]",
+        "reachable",
+        "IK solutions",
+        "smallest singular value",
         "bodies in collision",
     )
-    return f"<h2>Target poses</h2>{_table(columns, rows)}"
+    return _table(columns, rows)
 
 
 def _embedded_image(png: bytes, alt: str) -> str:
@@ -213,284 +406,3 @@ def _figure(title: str, figure: Figure) -> str:
     plt.close(figure)
     image = _embedded_image(stream.getvalue(), title)
     return f"<h2>{escape(title)}</h2><figure>{image}</figure>"
-
-
-def _plot_results(moves: Rows, setups: Sequence[str]) -> Figure:
-    """Plot the fraction of moves with each result as horizontal bars."""
-    results = [result for result, _ in Counter(row["result"] for row in moves).most_common()]
-    results = [PLANNED, *(result for result in results if result != PLANNED)]
-    figure, axes = plt.subplots(figsize=(12, 1.6 + 0.55 * len(results) * max(1, len(setups) / 2)))
-    height = 0.8 / len(setups)
-    for k, setup in enumerate(setups):
-        rows = [row for row in moves if row["setup"] == setup]
-        counts = Counter(row["result"] for row in rows)
-        fractions = [counts[result] / max(1, len(rows)) for result in results]
-        positions = np.arange(len(results)) + k * height
-        axes.barh(positions, fractions, height, label=setup)
-        for y, fraction, result in zip(positions, fractions, results, strict=True):
-            axes.text(fraction + 0.005, y, str(counts[result]), va="center", fontsize=12)
-    axes.set_yticks(np.arange(len(results)) + 0.4 - height / 2, results)
-    axes.invert_yaxis()
-    axes.set(xlabel="fraction of the legal moves", xlim=(0, 1))
-    if len(setups) > 1:
-        axes.legend()
-    return figure
-
-
-def _plot_planned_fractions(
-    axes: Any,
-    moves: Rows,
-    setups: Sequence[str],
-    group_key: Callable[[Mapping[str, Any]], str],
-    title: str,
-) -> None:
-    """Plot the fraction of moves planned in each group as bars with confidence intervals."""
-    groups = sorted({group_key(row) for row in moves})
-    width = 0.8 / len(setups)
-    for k, setup in enumerate(setups):
-        statistics = []
-        for group in groups:
-            rows = [row for row in moves if row["setup"] == setup and group_key(row) == group]
-            planned = sum(row["result"] == PLANNED for row in rows)
-            statistics.append((planned / max(1, len(rows)), *wilson_interval(planned, len(rows))))
-        fraction, low, high = np.array(statistics).T
-        error = np.clip([fraction - low, high - fraction], 0, None)
-        positions = np.arange(len(groups)) + k * width
-        axes.bar(positions, fraction, width, yerr=error, capsize=3, label=setup)
-    axes.set_xticks(
-        np.arange(len(groups)) + 0.4 - width / 2,
-        groups,
-        rotation=40,
-        ha="right",
-        rotation_mode="anchor",
-        fontsize=12,
-    )
-    axes.set(title=title, ylim=(0, 1))
-
-
-def _height_interval(row: Mapping[str, Any]) -> str:
-    """Return the interval of 10 cm of the height of the picked object's top face."""
-    low = 10 * int(row["pick_top"] // 0.1)
-    return f"{low:2d} to {low + 10} cm"
-
-
-def _plot_by_object(moves: Rows, setups: Sequence[str]) -> Figure:
-    figure, axes = plt.subplots(1, 3, figsize=(15, 5.2), sharey=True, width_ratios=(2, 1, 1.3))
-    _plot_planned_fractions(
-        axes[0], moves, setups, lambda row: str(row["object_class"]).replace("_", " "), "class"
-    )
-    _plot_planned_fractions(
-        axes[1], moves, setups, lambda row: str(row["resting_side"]), "resting pose"
-    )
-    _plot_planned_fractions(
-        axes[2],
-        moves,
-        setups,
-        _height_interval,
-        "height of the top face",
-    )
-    axes[0].set_ylabel(_PLANNED_LABEL)
-    if len(setups) > 1:
-        axes[2].legend(fontsize=11)
-    return figure
-
-
-def _plot_heatmap(
-    axes: Any, values: NDArray[np.float64], extent: Sequence[float], max_value: float
-) -> Any:
-    axes.grid(visible=False)
-    return axes.imshow(
-        values.T,
-        origin="lower",
-        extent=extent,
-        vmin=0,
-        vmax=max_value,
-        cmap="viridis",
-        aspect="equal",
-    )
-
-
-def _plot_by_pick_position(moves: Rows, setups: Mapping[str, WorkCell]) -> Figure:
-    """Plot the fraction of moves planned over the support, on a grid of 7 by 7 cells."""
-    positions = np.abs([(row["pick_x"], row["pick_y"]) for row in moves])
-    half_x, half_y = np.max(
-        [*positions, *(cell.support.half_size for cell in setups.values())], axis=0
-    )
-    edges_x = np.linspace(-half_x, half_x, 8)
-    edges_y = np.linspace(-half_y, half_y, 8)
-    figure, axes = plt.subplots(1, len(setups), figsize=(6.6 * len(setups), 5.6), squeeze=False)
-    for panel, setup in zip(axes[0], setups, strict=True):
-        rows = [row for row in moves if row["setup"] == setup]
-        x = np.array([row["pick_x"] for row in rows])
-        y = np.array([row["pick_y"] for row in rows])
-        is_planned = np.array([row["result"] == PLANNED for row in rows], float)
-        count, _, _ = np.histogram2d(x, y, bins=(edges_x, edges_y))
-        planned, _, _ = np.histogram2d(x, y, bins=(edges_x, edges_y), weights=is_planned)
-        with np.errstate(invalid="ignore"):
-            fraction = planned / count
-        image = _plot_heatmap(panel, fraction, (-half_x, half_x, -half_y, half_y), 1.0)
-        for i, center_x in enumerate((edges_x[1:] + edges_x[:-1]) / 2):
-            for j, center_y in enumerate((edges_y[1:] + edges_y[:-1]) / 2):
-                if count[i, j]:
-                    panel.text(
-                        center_x,
-                        center_y,
-                        f"{count[i, j]:.0f}",
-                        ha="center",
-                        va="center",
-                        color="white" if fraction[i, j] < 0.6 else "black",
-                        fontsize=11,
-                    )
-        panel.set(title=setup, xlabel="x in the tray frame [m]", ylabel="y [m]")
-    figure.colorbar(image, ax=axes[0], label=_PLANNED_LABEL)
-    return figure
-
-
-def _plot_reachability(reachability_map: Mapping[str, Any]) -> Figure:
-    heights = reachability_map["heights"]
-    half_x, half_y = (
-        values[-1] + (values[1] - values[0]) / 2
-        for values in (reachability_map["x"], reachability_map["y"])
-    )
-    extent = (-half_x, half_x, -half_y, half_y)
-    figure, axes = plt.subplots(
-        2, len(heights), figsize=(3.9 * len(heights), 7.2), squeeze=False, sharex=True, sharey=True
-    )
-    max_manipulability = max(0.01, float(np.max(reachability_map["manipulability"])))
-    for k, height in enumerate(heights):
-        fraction = np.array(reachability_map["reachable_fraction"][k])
-        manipulability = np.array(reachability_map["manipulability"][k])
-        top = _plot_heatmap(axes[0][k], fraction, extent, 1.0)
-        bottom = _plot_heatmap(axes[1][k], manipulability, extent, max_manipulability)
-        axes[0][k].set_title(f"{100 * height:g} cm above the floor", fontsize=13)
-        axes[1][k].set_xlabel("x in the tray frame [m]")
-    for row in axes:
-        row[0].set_ylabel("y [m]")
-    figure.colorbar(top, ax=axes[0], label="reachable fraction of 12 yaws")
-    figure.colorbar(bottom, ax=axes[1], label=_MANIPULABILITY_LABEL)
-    return figure
-
-
-def _plot_base_positions(bases: Rows, cell: WorkCell) -> Figure:
-    x = sorted({row["x"] for row in bases})
-    y = sorted({row["y"] for row in bases})
-    figure, axes = plt.subplots(1, 2, figsize=(13, 6))
-    half_x = (x[1] - x[0]) / 2
-    half_y = (y[1] - y[0]) / 2
-    extent = (x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y)
-    labels = {"reachable_fraction": _REACHABLE_LABEL, "manipulability": _MANIPULABILITY_LABEL}
-    best = max(bases, key=lambda row: (row["reachable_fraction"], row["manipulability"]))
-    for panel, (name, label) in zip(axes, labels.items(), strict=True):
-        value_at = {(row["x"], row["y"]): row[name] for row in bases}
-        values = np.array([[value_at[i, j] for j in y] for i in x])
-        image = _plot_heatmap(panel, values, extent, max(0.01, float(values.max())))
-        figure.colorbar(image, ax=panel, label=label)
-        panel.plot(*cell.robot.base.translation[:2], "r*", markersize=18, label="first setup")
-        panel.plot(
-            best["x"],
-            best["y"],
-            "wo",
-            markersize=12,
-            markeredgecolor="black",
-            label="best of the grid",
-        )
-        panel.set(xlabel="x of the base in the tray frame [m]", ylabel="y of the base [m]")
-        panel.legend(fontsize=11, loc="upper left")
-    return figure
-
-
-def _plot_pose_errors(pose_errors: Rows) -> Figure:
-    figure, axes = plt.subplots(figsize=(10, 5))
-    errors = sorted({row["error"] for row in pose_errors})
-    for setup in dict.fromkeys(row["setup"] for row in pose_errors):
-        statistics = []
-        for error in errors:
-            rows = [row for row in pose_errors if row["setup"] == setup and row["error"] == error]
-            valid = sum(row["result"] == "holds" for row in rows)
-            statistics.append((valid / len(rows), *wilson_interval(valid, len(rows))))
-        fraction, low, high = np.array(statistics).T
-        interval = np.clip([fraction - low, high - fraction], 0, None)
-        axes.errorbar(
-            1000 * np.array(errors), fraction, interval, marker="o", capsize=5, label=setup
-        )
-    axes.set(
-        xlabel="standard deviation of the position error in x and in y [mm]; yaw: 0.5 deg per mm",
-        ylabel="fraction of the plans that are valid",
-        ylim=(0, 1.03),
-    )
-    axes.legend()
-    return figure
-
-
-def _extreme_cases_html(
-    moves: Rows, setups: Mapping[str, WorkCell], load_scene: Callable[[str], Scene]
-) -> list[str]:
-    """Return images of the moves nearest to a collision, the longest, and one of each failure."""
-    planned = [row for row in moves if row["result"] == PLANNED]
-    near = [row for row in planned if row["clearance"] is not None]
-    nearest = sorted(near, key=lambda row: float(row["clearance"]))[:CASES_PER_KIND]
-    longest = sorted(planned, key=lambda row: -float(row["motion_s"]))[:CASES_PER_KIND]
-    cases = [("Nearest to a collision", row) for row in nearest]
-    cases += [("Longest motion", row) for row in longest]
-    failures = (row for row in moves if row["result"] not in (PLANNED, "no free spot"))
-    for reason in dict.fromkeys(row["result"] for row in failures):
-        first = next(row for row in moves if row["result"] == reason)
-        cases.append((f"Failure: {reason}", first))
-    renderer = SceneRenderer()
-    return [
-        _case_html(kind, row, load_scene(row["scene"]), setups[row["setup"]], renderer)
-        for kind, row in cases
-    ]
-
-
-def _case_html(
-    kind: str, row: Mapping[str, Any], scene: Scene, cell: WorkCell, renderer: SceneRenderer
-) -> str:
-    """Return the images of a move: the scene, and the arm along the plan if there is one."""
-    X_TO = None
-    if row["place_x"] is not None:
-        p_TO = (row["place_x"], row["place_y"], row["place_z"])
-        X_TO = Pose(p_TO, scene[row["pick"]].X_TO.quaternion)
-    title = f"{row['setup']}, {row['scene']}: {row['pick']} to {row['place']}"
-    images = [renderer.render_annotated(scene, Annotations(moved=row["pick"], X_T_placed=X_TO))]
-    if row["result"] == PLANNED:
-        distance = "more than 30 mm"
-        if row["clearance"] is not None:
-            distance = f"{1000 * row['clearance']:.1f} mm ({row['nearest_pair']})"
-        detail = f"motion {row['motion_s']:.2f} s, smallest distance {distance}"
-        if X_TO is not None:
-            planner = PickPlacePlanner(
-                cell.with_support(scene.support), PlannerConfig(optimize=False)
-            )
-            plan = planner.plan(scene.objects, row["pick"], X_TO)
-            if isinstance(plan, PickPlacePlan):
-                images.append(render_filmstrip(scene, _plan_key_frames(plan, scene, cell), cell))
-    else:
-        detail = ": ".join(filter(None, (row["result"], row["detail"])))
-    embedded = "".join(_embedded_image(_encode_png(image), title) for image in images)
-    return (
-        f'<div class="case"><h3>{escape(kind)}</h3><p>{escape(title)}: {escape(detail)}</p>'
-        f"{embedded}</div>"
-    )
-
-
-def _plan_key_frames(plan: PickPlacePlan, scene: Scene, cell: WorkCell) -> list[MotionSample]:
-    """Return three frames of a plan: at the grasp, halfway to the place, and at the place."""
-    carry = plan.segments[1].trajectory
-    tool = ToolKinematics(cell, plan.tool)
-    frames = []
-    for time in (0.0, carry.end_time() / 2, carry.end_time()):
-        q = carry.value(time).ravel()
-        X_TO = RigidTransform(tool.pose(q)) @ plan.X_OG.inverse()
-        poses = {**scene.poses, plan.pick: pose_from_transform(X_TO)}
-        frames.append(MotionSample(time, poses, ArmState(tuple(q.tolist()), (), (), plan.tool)))
-    return frames
-
-
-def _encode_png(image: NDArray[np.uint8]) -> bytes:
-    """Return an image as PNG, at most 1080 by 480 pixels."""
-    stream = io.BytesIO()
-    small = Image.fromarray(image)
-    small.thumbnail((1080, 480))
-    small.save(stream, format="PNG", optimize=True)
-    return stream.getvalue()

@@ -104,12 +104,24 @@ def describe_solution(solution: Mapping[str, Any]) -> dict[str, str]:
 
 
 def describe_feasibility(summary: Mapping[str, Any]) -> dict[str, str]:
-    """Return the `summary.json` of a feasibility study as texts by setup."""
+    """Return the `summary.json` of a feasibility study as texts by setup, best first."""
+    by_name = {setup["name"]: setup for setup in summary["setups"]}
     rows = {}
-    for name, statistics in summary["setups"].items():
-        failures = {k: n for k, n in statistics["results"].items() if k != "planned"}
-        text = f"{statistics['planned']} of {_number(statistics['moves'], 'move')} planned"
-        rows[name] = f"{text}; failures: {_counts(failures)}"
+    for name in summary["ranking"]:
+        setup = by_name[name]
+        share = _fraction(setup["share"], setup["share_ci95"], "possible moves")
+        text = f"{setup['planned']} of {setup['possible']} planned, {share}"
+        if setup["failures"]:
+            text += f"; failures: {_counts(setup['failures'])}"
+        if setup["impossible"]:
+            text += f"; impossible: {_counts(setup['impossible'])}"
+        if setup["sequences"]:
+            found = setup["sequences"]
+            text += f"; {found['solved']} of {found['scenes']} scenes searched to the end"
+        rows[name] = text
+    for name, setup in by_name.items():
+        if name not in rows:
+            rows[name] = setup["unusable"] or "no possible move"
     return rows
 
 
