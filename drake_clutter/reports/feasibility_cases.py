@@ -47,6 +47,7 @@ def select_cases(moves: Sequence[Row]) -> list[tuple[str, Row]]:
         cases.append(("Longest motion", max(planned, key=lambda row: row["unoptimized_s"])))
     failed = [row for row in moves if row["possible"] and row["result"] != PLANNED]
     reasons = sorted({r["result"] for r in failed}, key=lambda x: -_count(failed, x))
+    cases = [(k, row) for n, (k, row) in enumerate(cases) if row not in [r for _, r in cases[:n]]]
     cases += [
         (f"Failure: {reason}", next(row for row in failed if row["result"] == reason))
         for reason in reasons[:MAX_CASES_PER_SETUP]

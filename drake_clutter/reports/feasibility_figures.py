@@ -29,7 +29,7 @@ PLOT_STYLE: dict[Any, Any] = {
     "grid.alpha": 0.35,
     "figure.constrained_layout.use": True,
 }
-_SHARE_LABEL = "share of the possible moves that are planned"
+_SHARE_LABEL = "planned share of the possible moves"
 
 
 def plot_ranking(summary: Row) -> Figure:
@@ -204,7 +204,7 @@ def plot_by_position(
                     )
         panel.set_title(setup, fontsize=11)
         panel.set(xlabel="x in T [m]", ylabel="y [m]")
-    figure.colorbar(image, ax=panels, label=_SHARE_LABEL, shrink=0.8)
+    figure.colorbar(image, ax=panels, label="planned share", shrink=0.8)
     return figure
 
 
@@ -299,8 +299,8 @@ def plot_base_search(bases: Rows, finalists: Sequence[WorkCell]) -> Figure:
 def plot_noise(summary: Row) -> Figure:
     """Plot the share of moves that are placed in simulation over the size of each error."""
     titles = {
-        "pose": ("pose of each object", "position [mm], yaw 0.5 deg per mm", 1000),
-        "calibration": ("camera calibration", "position [mm], yaw 0.1 deg per mm", 1000),
+        "pose": ("pose of each object", "position [mm], yaw 0.5 deg/mm", 1000),
+        "calibration": ("camera calibration", "position [mm], yaw 0.1 deg/mm", 1000),
         "mass": ("mass of the object", "mass [%]", 100),
     }
     figure, axes = plt.subplots(1, len(titles), figsize=(14, 4.6), sharey=True)
@@ -315,7 +315,7 @@ def plot_noise(summary: Row) -> Figure:
             error = np.clip([share - low, high - share], 0, None)
             panel.errorbar(sizes, share, error, marker="o", capsize=4, label=setup["name"])
         panel.set_title(title, fontsize=12)
-        panel.set(xlabel=f"standard deviation: {label}", ylim=(0, 1.03))
+        panel.set(xlabel=f"standard deviation\n{label}", ylim=(0, 1.03))
     axes[0].set_ylabel("share of the moves placed in simulation")
     axes[0].legend(fontsize=10)
     return figure
