@@ -19,7 +19,7 @@ _MODULES = (
     "drake_clutter.agents.learned_explorer",
     "drake_clutter.cli",
     "drake_clutter.commands.evaluate_explorers",
-    "drake_clutter.commands.feasibility_job",
+    "drake_clutter.commands.feasibility_run",
     "drake_clutter.commands.generate_scenes",
     "drake_clutter.commands.render_scene",
     "drake_clutter.commands.run_scenario",

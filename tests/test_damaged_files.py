@@ -25,6 +25,7 @@ import torch
 import trimesh
 import yaml
 from conftest import DEFAULT_CELL, TRAY, rng
+from feasibility_jobs import feasibility_job
 from PIL import Image
 from pydrake.systems.framework import DiagramBuilder
 from safetensors import safe_open
@@ -51,10 +52,13 @@ from drake_clutter.assets import build_assets
 from drake_clutter.assets.mesh_appearance import textured_parts
 from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.work_cell import load_cell
-from drake_clutter.commands.feasibility_job import FeasibilityJob, StudyPart, load_part
+from drake_clutter.commands.feasibility_parts import PartKind, StudyPart, load_part
 from drake_clutter.commands.generate_scenes import read_generation_progress
 from drake_clutter.commands.job_file import JOB_FILE, open_job_folder
 from drake_clutter.config import ClutterConfig, ExplorationConfig, upgrade_config
+from drake_clutter.feasibility.move_study import MoveRecord
+from drake_clutter.feasibility.pose_noise import NoiseRecord
+from drake_clutter.feasibility.sequences import SequenceRecord
 from drake_clutter.files import MAX_ERROR_LENGTH, InputError, write_json
 from drake_clutter.grammar import SceneGrammar
 from drake_clutter.learning.checkpoint import save_checkpoint
@@ -384,8 +388,7 @@ def cloning_training(folder: Path) -> Reader:
 
 
 def job_file(folder: Path) -> Reader:
-    cells = {"default": DEFAULT_CELL}
-    job = FeasibilityJob((Path("scene.yaml"),), cells, (), 0, ClutterConfig(), None).to_dict()
+    job = feasibility_job(Path("scene.yaml")).to_dict()
     with open_job_folder(folder, job):
         (folder / "moves.csv").touch()
 
@@ -480,31 +483,31 @@ def results_file(folder: Path) -> Reader:
 
 
 def feasibility_parts(folder: Path) -> Reader:
-    row = {
-        **dict.fromkeys(("setup", "scene", "pick", "place", "object_class", "resting_side"), "a"),
-        **dict.fromkeys(("pick_x", "pick_y", "pick_top", "planning_s", "motion_s"), 0.5),
-        **dict.fromkeys(("place_x", "place_y", "place_z", "failure_value", "clearance"), None),
-        **dict.fromkeys(("num_below", "num_attempts"), 2),
-        **dict.fromkeys(("result", "detail", "nearest_pair"), "b"),
-        "manipulability": 0.1,
-    }
-    error = {key: row[key] for key in ("setup", "scene", "pick", "place", "result")}
-    grid = [[[0.5, None], [1.0, 0.0]]]
+    move = to_plain(MoveRecord("setup", "scene", "a", "tray", "box", "flat", 0.1, 0.2, 0.3, 2))
+    row = {k: None if v != v else v for k, v in move.items()}  # NaN is null
+    noise = to_plain(NoiseRecord("setup", "scene", "a", "tray", "pose", 0.01, "placed", "b"))
+    sequence = SequenceRecord("setup", "scene", "random", False, 3, 2, 4, 1, 0.5, "gave up")
+    grid = [[[[0.5, None], [1.0, 0.0]]]]
     target = {
-        **{"target": "up", "num_solutions": 0, "manipulability": None, "q": None},
-        "blocking_bodies": "",
+        **{"setup": "setup", "target": "up", "num_solutions": 0, "reachable": False},
+        **{"singular_value": 0.0, "q": None, "obstacles": ""},
     }
+    found = {"scene": "a", "unstable": False}
     parts: dict[StudyPart, Any] = {
-        StudyPart("a", 0): {
-            **{"scene": "a", "unstable": False, "moves": [row]},
-            "pose_errors": [error | {"error": 0.01}],
+        StudyPart(PartKind.MAP, 0): {"tools": ["large"]},
+        StudyPart(PartKind.BASES, 0, 0): {**found, "possible": 3, "reachable": [1, 3]},
+        StudyPart(PartKind.SETUP, 0): {
+            **{"unusable": None, "home": {"q": [0.1, 0.2], "is_given": True, "obstacle": ""}}
         },
-        StudyPart("a"): {
-            **{"x": [0.0, 0.1], "y": [0.0, 0.1], "heights": [0.2], "targets": [target]},
-            **dict.fromkeys(("reachable_fraction", "manipulability"), grid),
-        },
-        StudyPart("a", None, -0.5): {
-            "bases": [{"x": 0.1, "y": 0.2, "reachable_fraction": 0.5, "manipulability": 0.1}]
+        StudyPart(PartKind.SETUP, 1): {"unusable": "no home", "home": None},
+        StudyPart(PartKind.MOVES, 0, 0): {**found, "moves": [row], "noise": [noise]},
+        StudyPart(PartKind.SEQUENCE, 0, 0): {**found, "sequence": to_plain(sequence)},
+        StudyPart(PartKind.REACH, 0): {
+            **{"tilts_deg": [0.0], "x": [0.0, 0.1], "y": [0.0, 0.1], "heights": [0.2]},
+            **{
+                "targets": [target],
+                **dict.fromkeys(("reachable_fraction", "singular_value"), grid),
+            },
         },
     }
     for part, document in parts.items():

@@ -33,13 +33,12 @@ from typer.testing import CliRunner
 from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.cli import app
-from drake_clutter.commands import feasibility_job
+from drake_clutter.commands import feasibility_parts
 from drake_clutter.commands.explore_scene import read_moves
 from drake_clutter.config import load_config
-from drake_clutter.reports import feasibility_report
+from drake_clutter.reports import feasibility_cases
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.systems.scenario import Scenario
-from drake_clutter.tasks import feasibility_study
 from drake_clutter.validation import load_config_as, to_plain, validate
 from drake_clutter.yaml_io import parse_yaml
 
@@ -170,12 +169,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ignore = shutil.ignore_patterns("mug", "package.xml", "own_objects")
     shutil.copytree(ROOT / "examples", tmp_path / "examples", ignore=ignore)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(feasibility_job, "BASE_GRID_X", [-0.8, -0.6])
-    monkeypatch.setattr(feasibility_job, "BASE_GRID_Y", [0.0, 0.2])
-    monkeypatch.setattr(feasibility_job, "MAP_SPACING", 0.3)
-    monkeypatch.setattr(feasibility_job, "MAP_HEIGHTS", (0.05, 0.3))
-    monkeypatch.setattr(feasibility_report, "CASES_PER_KIND", 1)
-    monkeypatch.setattr(feasibility_study, "MAX_NOISY_MOVES", 1)
+    monkeypatch.setattr(feasibility_parts, "MAP_SPACING", 0.3)
+    monkeypatch.setattr(feasibility_parts, "MAP_HEIGHTS", (0.05, 0.3))
+    monkeypatch.setattr(feasibility_cases, "MAX_CASES_PER_SETUP", 1)
     return tmp_path
 
 

@@ -1,8 +1,9 @@
-"""Feasibility studies: move and reachability results, and resuming a study."""
+"""Feasibility studies: setups and homes, moves, margins, maps, searches, and resuming a study."""
 
 import csv
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,20 +12,41 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from conftest import DEFAULT_CELL, ONE_CUP, cell_with, resting, rng, scene_of
-from drake_clutter.planning.reachability import ReachabilityAnalysis, score_base_positions
-from drake_clutter.tasks.feasibility_study import (
+from typer.testing import CliRunner
+
+from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.cli import app
+from drake_clutter.commands import feasibility_job as command
+from drake_clutter.commands import feasibility_parts
+from drake_clutter.config import ClutterConfig
+from drake_clutter.feasibility.base_search import make_base_grids, select_finalists
+from drake_clutter.feasibility.home_search import Home, HomeSearch, view_corners
+from drake_clutter.feasibility.inverse_reachability import (
+    SPACING,
+    InverseReachabilityMap,
+    MovePoses,
+    find_move_poses,
+)
+from drake_clutter.feasibility.margins import arm_reach, compute_margins, scaled_jacobians
+from drake_clutter.feasibility.move_study import (
     MOVE_RECORD_FIELDS,
     PLANNED,
     FeasibilityStudy,
     objects_below,
     resting_side,
 )
-from typer.testing import CliRunner
-
-from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.cli import app
-from drake_clutter.commands import feasibility_job as command
-from drake_clutter.config import ClutterConfig
+from drake_clutter.feasibility.pose_noise import NoiseKind, add_noise, scale_mass
+from drake_clutter.feasibility.reach_map import ReachabilityAnalysis, tilted_pose
+from drake_clutter.feasibility.setups import (
+    Setup,
+    SetupRequest,
+    Sweep,
+    UnusableSetup,
+    parse_sweep,
+    prepare_setup,
+    sweep_setups,
+)
+from drake_clutter.feasibility.summary import share_interval, summarize_study
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
 from drake_clutter.planning.pick_place_plan import (
@@ -35,13 +57,16 @@ from drake_clutter.planning.pick_place_plan import (
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import downward_pose
-from drake_clutter.reports import feasibility_report
+from drake_clutter.reports import feasibility_cases, feasibility_figures
+from drake_clutter.reports.feasibility_report import answer_sentences
 from drake_clutter.resources import resource_path
+from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.robots.ur_kinematics import jacobian, manipulability
 from drake_clutter.scenes.interfaces import Verdict
 from drake_clutter.scenes.scene import Pose
 from drake_clutter.scenes.scene_file import save_scene
-from drake_clutter.tasks import feasibility_study
+from drake_clutter.station.station_simulation import StationSimulation
+from drake_clutter.statistics import ratio_interval
 
 SCENE = scene_of(
     resting("pudding_box"),
@@ -52,9 +77,7 @@ SCENE = scene_of(
 
 
 def study(cell: WorkCell | None = None) -> FeasibilityStudy:
-    return FeasibilityStudy(
-        "it", replace(ClutterConfig(), cell=cell or DEFAULT_CELL), PlannerConfig(optimize=False), 0
-    )
+    return FeasibilityStudy("it", replace(ClutterConfig(), cell=cell or DEFAULT_CELL), 0)
 
 
 def test_manipulability_in_closed_form() -> None:
@@ -76,10 +99,14 @@ def test_every_legal_move_has_a_row() -> None:
         picked = SCENE[row.pick]
         assert (row.pick_x, row.pick_y) == pytest.approx(picked.X_TO.p[:2], abs=1e-6)
         assert row.pick_top == pytest.approx(picked.corners_T[:, 2].max(), abs=1e-6)
-        assert math.isfinite(row.motion_s) == (row.result == PLANNED)
+        assert math.isfinite(row.unoptimized_s) == (row.result == PLANNED)
+        assert row.possible == (row.result == PLANNED), "the arm reaches everything here"
         assert math.isfinite(row.place_x) == (row.result != "no free spot")
         assert row.num_below == (1 if row.pick == "gelatin_box" else 0)
         assert row.tool == ("single" if row.result == PLANNED else "")
+    optimized = [row for row in rows if math.isfinite(row.cycle_s)]
+    assert len(optimized) == min(5, sum(row.result == PLANNED for row in rows))
+    assert all(2.0 < row.cycle_s < row.unoptimized_s for row in optimized)
     again = study(cell_with(ONE_CUP)).plan_all_moves("scene", 0, SCENE)
     assert [str(replace(row, planning_s=0.0)) for row in rows] == [
         str(replace(row, planning_s=0.0)) for row in again
@@ -121,60 +148,318 @@ def test_infeasible_moves_have_a_reason() -> None:
     assert reason(cell_with("robot.payload=1")).reason is PlanningFailureReason.TOO_HEAVY
 
 
-def test_larger_pose_errors_invalidate_more_plans() -> None:
-    it = study()
-    rows = it.plan_all_moves("scene", 0, SCENE)
-    found = it.evaluate_pose_errors("scene", 0, SCENE, rows)
-    planned = sum(row.result == PLANNED for row in rows)
-    assert len(found) == 5 * min(6, planned)
-    holds = [
-        sum(row.result == "holds" for row in found if row.error == error)
-        for error in (0.002, 0.040)
+def test_margins_of_a_plan() -> None:
+    planner = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(optimize=False))
+    place = SCENE["tomato_soup_can"].X_TO.translated((0.2, 0.1, 0.001))
+    plan = planner.plan(SCENE.objects, "tomato_soup_can", place)
+    assert isinstance(plan, PickPlacePlan)
+    found = compute_margins(plan, DEFAULT_CELL, planner.tools[plan.tool])
+    q = np.vstack(
+        [s.trajectory.vector_values(np.linspace(0, s.duration, 200)).T for s in plan.segments]
+    )
+    lower, upper = planner.robot.position_limits.T
+    assert found.joint_margin == pytest.approx(np.minimum(q - lower, upper - q).min(), abs=2e-3)
+    scale = arm_reach(planner.robot) ** 3
+    expected = planner.robot.manipulability(q).min() / scale
+    assert found.manipulability == pytest.approx(expected, rel=0.02)
+    values = np.linalg.svd(scaled_jacobians(planner.robot, q), compute_uv=False)
+    assert found.singular_value == pytest.approx(values.min(), rel=0.02)
+    assert 0.1 < found.torque_share <= 1.0
+    assert 0.1 < found.load_share <= 1.0 + 1e-3
+    assert 1 <= found.num_connected <= found.num_ik_solutions <= 8
+
+
+def test_a_singular_arm_has_a_singular_value_of_zero() -> None:
+    """A UR with a straight elbow, and with two parallel wrist axes."""
+    robot = load_robot(DEFAULT_CELL.robot)
+    q = np.array([[0.3, -1.0, 0.0, -1.0, 1.2, 0.0], [0.3, -1.0, 1.0, -1.0, 0.0, 0.0]])
+    values = np.linalg.svd(scaled_jacobians(robot, q), compute_uv=False)
+    assert values[:, -1] == pytest.approx([0.0, 0.0], abs=1e-9)
+
+
+def test_a_given_home_is_kept_if_it_is_clear() -> None:
+    home = HomeSearch(DEFAULT_CELL).find_home(keep=True)
+    assert home == Home(DEFAULT_CELL.robot.home, is_given=True)
+
+
+def test_a_home_is_found_beside_the_view() -> None:
+    """On the table, the arm at the cell's home hides the tray from the camera."""
+    low = cell_with("robot.base.z=0")
+    search = HomeSearch(low)
+    obstacle = search.find_obstacle(np.array(low.robot.home))
+    assert obstacle is not None
+    assert "view_0" in obstacle.pair
+    home = search.find_home(keep=True)
+    assert isinstance(home, Home)
+    assert not home.is_given
+    assert "view_0" in home.obstacle
+    assert search.find_obstacle(np.array(home.q)) is None
+    assert search.find_home(keep=True) == home, "the same again"
+    setup = prepare_setup("low", SetupRequest(low, keep_home=False))
+    assert isinstance(setup, Setup)
+    assert setup.cell.robot.home == home.q
+
+
+def test_the_view_is_the_hull_of_camera_and_support() -> None:
+    corners = view_corners(DEFAULT_CELL)
+    assert corners.shape == (9, 3)
+    assert corners.max(axis=0) == pytest.approx([0.35, 0.35, 1.6])
+    assert corners.min(axis=0) == pytest.approx([-0.35, -0.35, 0.0])
+
+
+def test_unusable_setups_have_a_reason() -> None:
+    def reason(*settings: str) -> str:
+        setup = prepare_setup("it", SetupRequest(cell_with(*settings), keep_home=False))
+        assert isinstance(setup, UnusableSetup)
+        return setup.reason
+
+    assert reason("robot.base.x=-0.2") == "the base stands in the support"
+    assert reason("robot.base.x=-5") == "no part of the support is in reach"
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("robot.base.z=0:0.6:0.2", (0.0, 0.2, 0.4, 0.6)),
+        ("robot.base.z=0:0.5:0.2", (0.0, 0.2, 0.4)),
+        ("robot.base.z=0.3:-0.3:-0.3", (0.3, 0.0, -0.3)),
+        ("robot.base.z=0.1", (0.1,)),
+        ("robot.base.z=0.1,0.4", (0.1, 0.4)),
+    ],
+)
+def test_sweeps(text: str, values: Sequence[float]) -> None:
+    sweep = parse_sweep("--sweep", text)
+    assert sweep.field == "robot.base.z"
+    assert sweep.values == pytest.approx(values)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("robot.base.z", "expected FIELD=FIRST:LAST:STEP"),
+        ("robot.base.z=0:1", "expected FIELD=FIRST:LAST:STEP"),
+        ("robot.base.z=0:1:0", "expected FIELD=FIRST:LAST:STEP"),
+        ("robot.base.z=1:0:0.1", "expected FIELD=FIRST:LAST:STEP"),
+        ("robot.base.z=a,b", "expected FIELD=FIRST:LAST:STEP"),
+        ("robot.base.z=0.1,0.1", "with different values"),
+        ("robot.base.z=0:1:1e-9", "1000000001 values; expected at most 2000"),
+    ],
+)
+def test_invalid_sweeps(text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        parse_sweep("--sweep", text)
+
+
+def test_all_combinations_are_swept() -> None:
+    requests = {"default": SetupRequest(DEFAULT_CELL, keep_home=True)}
+    sweeps = [Sweep("robot.base.z", (0.0, 0.3)), Sweep("gripper.cups.0.extension", (0.1, 0.2))]
+    found = sweep_setups(requests, sweeps)
+    assert [*found] == [
+        f"robot.base.z={z}, gripper.cups.0.extension={e}" for z in ("0", "0.3") for e in (0.1, 0.2)
     ]
-    assert holds[0] > holds[1]
-    assert {row.result for row in found} - {"holds", "no plan"}, "some plans fail with a reason"
+    last = found["robot.base.z=0.3, gripper.cups.0.extension=0.2"]
+    assert last.cell == cell_with("gripper.cups.0.extension=0.2")
+    assert not last.keep_home
+    both = sweep_setups(requests | {"b": requests["default"]}, sweeps[:1])
+    assert "b, robot.base.z=0" in both
+    with pytest.raises(InputError, match=r"--sweep: 2002 setups; expected at most 2000"):
+        sweep_setups(requests, [Sweep("a", tuple(range(1001))), Sweep("b", (0.0, 1.0))])
+    with pytest.raises(InputError, match=r"--sweep robot\.base\.up=1: robot\.base\.up: is unknown"):
+        sweep_setups(requests, [Sweep("robot.base.up", (1.0,))])
 
 
 def test_the_reachability_map_agrees_with_single_poses() -> None:
-    reachability = ReachabilityAnalysis(DEFAULT_CELL)
-    found = reachability.compute_map((0.1, 1.5), 0.3)
-    assert found.reachable_fraction.shape == (2, 3, 3)
-    assert (found.reachable_fraction[0] == 1).all()
-    assert (found.reachable_fraction[1] < 1).any(), "too high"
-    middle = reachability.analyze_poses(downward_pose(0.0, np.array([0.0, 0.0, 0.1]))[None])
-    assert middle.num_solutions[0] > 0
-    assert middle.manipulability[0] == pytest.approx(float(manipulability(middle.q[0])))
-    away = reachability.analyze_poses(
-        np.array(
-            [
-                downward_pose(0.0, np.array([3.0, 0.0, 0.1])),
-                downward_pose(0.0, np.array([0.0, 0.0, -0.3])),
-            ]
-        )
-    )
-    assert away.num_solutions.tolist() == [0, 0]
-    assert away.blocking_bodies[0] == ""
-    assert "table" in away.blocking_bodies[1] or "floor" in away.blocking_bodies[1], (
-        "through the floor"
-    )
-    near, in_tray = score_base_positions(DEFAULT_CELL, [(-0.65, 0.0), (0.0, 0.0)])
-    assert near[0] == 1.0
-    assert in_tray == (0.0, 0.0)
+    analysis = ReachabilityAnalysis(DEFAULT_CELL)
+    found = analysis.compute_map((0.0, 90.0), (0.1, 1.5), 0.3)
+    assert found.reachable_fraction.shape == found.singular_value.shape == (2, 2, 3, 3)
+    assert (found.reachable_fraction[0, 0] == 1).all()
+    assert (found.reachable_fraction[0, 1] < 1).any(), "too high"
+    assert found.reachable_fraction[1, 0].mean() < 1, "the tool is horizontal near the floor"
+    middle = analysis.analyze_poses(downward_pose(0.0, np.array([0.0, 0.0, 0.1]))[None])
+    assert middle.is_reachable.tolist() == [True]
+    robot = load_robot(DEFAULT_CELL.robot)
+    values = np.linalg.svd(scaled_jacobians(robot, middle.q), compute_uv=False)
+    assert middle.singular_value[0] == pytest.approx(values[0, -1])
+    positions = [[3.0, 0.0, 0.1], [0.0, 0.0, -0.3]]
+    away = analysis.analyze_poses(np.array([downward_pose(0.0, np.array(p)) for p in positions]))
+    assert away.is_reachable.tolist() == [False, False]
+    assert away.num_solutions[0] == 0
+    assert away.obstacles[0] == ""
+    assert "table" in away.obstacles[1] or "floor" in away.obstacles[1], "through the floor"
 
 
 def test_the_reachability_map_covers_exactly_the_support() -> None:
-    found = ReachabilityAnalysis(cell_with("support.size=[0.4, 0.8]")).compute_map((0.1,), 0.15)
+    analysis = ReachabilityAnalysis(cell_with("support.size=[0.4, 0.8]"))
+    found = analysis.compute_map((0.0,), (0.1,), 0.15)
     assert found.x == pytest.approx([-0.15, 0.0, 0.15])
     assert found.y == pytest.approx(np.linspace(-0.35, 0.35, 6))
-    assert found.reachable_fraction.shape == found.manipulability.shape == (1, 3, 6)
+    assert found.reachable_fraction.shape == (1, 1, 3, 6)
+
+
+def test_a_tilted_tool_points_to_its_side() -> None:
+    X = tilted_pose(math.radians(30), math.radians(90), np.array([0.1, 0.2, 0.3]))
+    assert X[:3, 2] == pytest.approx([0.0, 0.5, -math.sqrt(0.75)])
+    assert X[:3, 3] == pytest.approx([0.1, 0.2, 0.3])
+    assert X[:3, :3] @ X[:3, :3].T == pytest.approx(np.eye(3))
+    assert np.linalg.det(X[:3, :3]) == pytest.approx(1.0)
+
+
+def disk_map(radius: float, *, branch: int = 0, lowest: float = 0.1) -> InverseReachabilityMap:
+    """Return a map in which one branch reaches a disk around the base, at z from 0 to 1 m."""
+    radii = np.arange(0.0, 1.0, SPACING)
+    shape = len(radii), 51, 24
+    branches = np.zeros(shape, np.uint8)
+    branches[radii <= radius] = 1 << branch
+    heights = np.full((*shape, 8), lowest, np.float32)
+    return InverseReachabilityMap(np.arange(51) * np.float64(SPACING), branches, heights)
+
+
+def move_rows(p_pick: Sequence[float], p_place: Sequence[float], top: float) -> MovePoses:
+    row = (*p_pick[:2], 0.3, *p_place[:2], 0.3, p_pick[2], p_place[2], top)
+    return MovePoses.join([np.array([row])])
+
+
+def test_inverse_reachability_of_a_disk() -> None:
+    """A base reaches a move if pick, place and the points above them are in its disk."""
+    moves = move_rows((0.3, 0.0, 0.1), (0.3, 0.4, 0.2), 0.4)
+    bases = np.array([[0.0, 0.2, 0.0], [-0.2, 0.2, 0.0], [0.3, 0.2, 0.15], [0.3, 0.2, -0.7]])
+    reaches = disk_map(0.45).find_reachable(moves, bases, table_height=-1.0)[:, 0]
+    # 0.36 m to both; 0.54 m to both; the pick is below the map; the way is above it.
+    assert reaches.tolist() == [True, False, False, False]
+
+
+def test_inverse_reachability_keeps_links_above_the_table() -> None:
+    moves = move_rows((0.3, 0.0, 0.1), (0.3, 0.1, 0.2), 0.4)
+    base = np.array([[0.0, 0.0, 0.0]])
+    assert disk_map(0.45, lowest=0.1).find_reachable(moves, base, table_height=0.05).all()
+    assert not disk_map(0.45, lowest=0.1).find_reachable(moves, base, table_height=0.096).any()
+
+
+def test_move_poses_follow_the_object() -> None:
+    """The place poses of the tool differ from the grasp by the move of the object."""
+    planner = PickPlacePlanner(DEFAULT_CELL, PlannerConfig())
+    can = SCENE["tomato_soup_can"]
+    grasps = planner.grasps(can)
+    assert not isinstance(grasps, PlanningFailure)
+    place = Pose((0.2, 0.1, can.X_TO.p[2] + 0.05), can.X_TO.quaternion)
+    rows = find_move_poses(can, place, [grasps[0]], planner.config)
+    assert rows.shape == (12, 9)
+    x, y, _, place_x, place_y, _, z, place_z, top = rows.T
+    assert place_x - x == pytest.approx(0.3 * np.ones(12))
+    assert place_y - y == pytest.approx(0.3 * np.ones(12))
+    assert place_z - z == pytest.approx(0.05 * np.ones(12))
+    assert top - place_z == pytest.approx(planner.config.lift_height * np.ones(12))
+    yaws = np.sort(rows[:, 2] % (2 * math.pi))
+    assert np.diff(yaws) == pytest.approx(np.full(11, math.pi / 6))
+
+
+def test_bases_in_the_support_are_left_out() -> None:
+    searches = [Sweep("robot.base.x", (-0.7, 0.0)), Sweep("robot.base.z", (0.0, 0.4))]
+    (grid,) = make_base_grids(DEFAULT_CELL, searches)
+    assert grid.bases.tolist() == [[-0.7, 0.0, 0.0, 0.0], [-0.7, 0.0, 0.4, 0.0]]
+    assert "robot.base.z=0.4" in grid.settings_of(1)
+    with pytest.raises(InputError, match="all bases stand in the support"):
+        make_base_grids(DEFAULT_CELL, [Sweep("robot.base.x", (0.0, 0.1))])
+    with pytest.raises(InputError, match="60000 bases; expected at most 50000"):
+        make_base_grids(DEFAULT_CELL, [Sweep("robot.base.x", tuple(range(60000)))])
+    with pytest.raises(InputError, match="the base is tilted; expected an upright one"):
+        make_base_grids(cell_with("robot.base.roll=180"), searches)
+
+
+def test_finalists_are_good_and_far_apart() -> None:
+    """The first has the best neighborhood; bad bases are left out."""
+    (grid,) = make_base_grids(DEFAULT_CELL, [Sweep("robot.base.y", tuple(np.arange(11) / 10))])
+    share = np.array([0.5, 0.2, 1.0, 0.2, 0.2, 0.9, 1.0, 1.0, 1.0, 0.9, 0.2])
+    found = [index for _, index in select_finalists([grid], [share])]
+    assert found == [7, 2, 8, 6] or found == [7, 2, 6, 8]
+
+
+def test_intervals_take_scenes_as_the_sample() -> None:
+    counts = [(3, 3), (2, 4), (0, 0), (5, 5)]
+    expected = ratio_interval([3, 2, 5], [3, 4, 5], (0, 5), (5, 5))
+    assert share_interval(counts) == expected
+    assert share_interval([(0, 0)]) is None
+    low, high = share_interval([(3, 3)] * 20) or (0.0, 0.0)
+    assert low == pytest.approx(0.025 ** (1 / 20), abs=1e-6), "the bound of Clopper and Pearson"
+    assert high == 1.0
+
+
+def move_row(setup: str, scene: str, pick: str, result: str) -> dict[str, Any]:
+    (record,) = study().plan_all_moves("s", 0, scene_of(resting("pudding_box")))[:1]
+    fields = {name: getattr(record, name) for name in MOVE_RECORD_FIELDS}
+    possible = result not in ("no free spot", "no seal")
+    changed = {"setup": setup, "scene": scene, "pick": pick, "result": result}
+    return fields | changed | {"possible": possible}
+
+
+def test_a_summary_is_of_the_possible_moves() -> None:
+    results = {
+        "a": [PLANNED, PLANNED, "unreachable", "no seal"],
+        "b": [PLANNED, "unreachable", "unreachable", PLANNED],
+    }
+    row = move_row("a", "0", "0", PLANNED)
+    moves = [
+        row
+        | {"setup": setup, "scene": str(k % 2), "pick": str(k), "result": result}
+        | {"possible": result != "no seal"}
+        for setup, found in results.items()
+        for k, result in enumerate(found)
+    ]
+    home = Home(DEFAULT_CELL.robot.home, is_given=True)
+    setups: dict[str, Setup | UnusableSetup] = {
+        "b": Setup("b", DEFAULT_CELL, home),
+        "a": Setup("a", DEFAULT_CELL, home),
+        "c": UnusableSetup("c", "no home"),
+    }
+    summary = summarize_study(setups, moves, (), (), ["0", "1"])
+    b, a, c = summary["setups"]
+    assert (a["possible"], a["planned"], a["share"]) == (3, 2, 2 / 3)
+    assert (a["impossible"], a["failures"]) == ({"no seal": 1}, {"unreachable": 1})
+    assert (b["possible"], b["planned"], b["share"]) == (4, 2, 0.5)
+    assert c["unusable"] == "no home"
+    assert summary["ranking"] == ["a", "b"]
+    (comparison,) = summary["comparisons"]
+    assert comparison["possible_in_both"] == 3
+    assert (comparison["planned_by_first_only"], comparison["planned_by_second_only"]) == (1, 0)
+    assert comparison["difference"] == pytest.approx(1 / 3)
+    low, high = comparison["difference_ci95"]
+    assert -1 <= low < 0 < high <= 1
+    first, second, third = answer_sentences(summary)
+    assert first.startswith("a does 2 of the 3 moves that 2 scenes and its tools allow: 66.7 %")
+    assert second == "Of its 1 failure, 1 are \u201cunreachable\u201d."
+    assert third.endswith(
+        "b is next, 33.3 points behind: the data are compatible with no difference."
+    )
+
+
+def test_pose_errors_have_their_size() -> None:
+    objects = [resting("tomato_soup_can", name=str(k)) for k in range(400)]
+    origin = objects[0].X_TO.p
+    moved = np.array([o.X_TO.p - origin for o in add_noise(objects, NoiseKind.POSE, 0.01, rng())])
+    assert moved[:, :2].std(axis=0) == pytest.approx([0.01, 0.01], rel=0.12)
+    assert (moved[:, 2] == 0).all()
+    shifted = np.array(
+        [o.X_TO.p - origin for o in add_noise(objects, NoiseKind.CALIBRATION, 0.01, rng())]
+    )
+    assert np.ptp(shifted, axis=0) == pytest.approx([0, 0, 0]), "all alike"
+    assert np.linalg.norm(shifted[0]) > 0
+    assert add_noise(objects, NoiseKind.MASS, 0.5, rng()) == objects
+
+
+def test_a_scaled_mass_is_simulated() -> None:
+    scene = scene_of(resting("tomato_soup_can"))
+    simulation = StationSimulation(DEFAULT_CELL, scene)
+    scale_mass(simulation, "tomato_soup_can", 1.5)
+    body = simulation.station.scene_plant.bodies["tomato_soup_can"]
+    mass = scene.objects[0].object_class.mass
+    assert body.get_mass(simulation.plant_context) == pytest.approx(1.5 * mass)
 
 
 def test_all_moves_are_in_the_plot_over_the_support() -> None:
-    row = {"setup": "it", "result": PLANNED}
+    row = {"setup": "it", "result": PLANNED, "possible": True}
     moves = [row | {"pick_x": 0.1, "pick_y": 0.45}, row | {"pick_x": -0.14, "pick_y": -0.4}]
-    figure = feasibility_report._plot_by_pick_position(
-        moves, {"it": cell_with("support.size=[0.3, 1.0]")}
-    )
+    cells = {"it": cell_with("support.size=[0.3, 1.0]")}
+    figure = feasibility_figures.plot_by_position(moves, cells, "pick", ["it"])
     (panel, _) = figure.axes
     assert sorted(text.get_text() for text in panel.texts) == ["1", "1"]
     assert panel.images[0].get_extent() == pytest.approx([-0.15, 0.15, -0.5, 0.5])
@@ -183,7 +468,8 @@ def test_all_moves_are_in_the_plot_over_the_support() -> None:
 
 def test_another_base_keeps_the_roll_and_pitch_of_the_cell() -> None:
     hanging = cell_with("robot.base.roll=180")
-    (cell,) = command.make_setups([[0.1, -0.2, 1.4, 30.0]], [], [], hanging).values()
+    (request,) = command.make_setups([[0.1, -0.2, 1.4, 30.0]], [], [], hanging).values()
+    cell = request.cell
     assert cell.robot.base.translation == (0.1, -0.2, 1.4)
     assert cell.robot.base.rpy_deg == (180.0, 0.0, 30.0)
 
@@ -215,12 +501,9 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def reduce_study(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command, "BASE_GRID_X", [-0.8, -0.6])
-    monkeypatch.setattr(command, "BASE_GRID_Y", [0.0, 0.2])
-    monkeypatch.setattr(command, "MAP_SPACING", 0.3)
-    monkeypatch.setattr(command, "MAP_HEIGHTS", (0.05, 0.3))
-    monkeypatch.setattr(feasibility_report, "CASES_PER_KIND", 1)
-    monkeypatch.setattr(feasibility_study, "MAX_NOISY_MOVES", 1)
+    monkeypatch.setattr(feasibility_parts, "MAP_SPACING", 0.3)
+    monkeypatch.setattr(feasibility_parts, "MAP_HEIGHTS", (0.05, 0.3))
+    monkeypatch.setattr(feasibility_cases, "MAX_CASES_PER_SETUP", 1)
 
 
 def table(path: Path) -> list[dict[str, str]]:
@@ -236,59 +519,52 @@ def test_a_study_from_the_command_line(
     targets = tmp_path / "targets.yaml"
     targets.write_text("[{name: up, translation: [0.1, 0.0, 0.2], quaternion: [0, 1, 0, 0]}]")
     out = tmp_path / "study"
-    arguments = [
-        "feasibility",
-        str(scenes),
-        "--out",
-        str(out),
-        "--base=-0.7,0,0.3,0",
-        "--tray=0.65,0,-0.3,0",
-        "--cell-override",
-        str(small),
-    ]
-    result = CliRunner().invoke(app, [*arguments, "--targets", str(targets), "--json"])
+    arguments = ["feasibility", str(scenes), "--out", str(out), "--base=-0.7,0,0.3,0"]
+    arguments += ["--base=-0.1,0,0.3,0", "--cell-override", str(small), "--targets", str(targets)]
+    arguments += ["--agent", "largest-clear"]
+    result = CliRunner().invoke(app, [*arguments, "--json"])
     assert result.exit_code == 0, result.output
     summary = json.loads((out / "summary.json").read_text())
     assert summary["unstable_scenes"] == ["falls"]
-    assert list(summary["setups"]) == ["small_cup", "base -0.7, 0, 0.3, 0", "tray 0.65, 0, -0.3, 0"]
+    names = ["small_cup", "base -0.7, 0, 0.3, 0", "base -0.1, 0, 0.3, 0"]
+    assert [setup["name"] for setup in summary["setups"]] == names
+    assert summary["setups"][2]["unusable"] == "the base stands in the support"
+    assert {*summary["ranking"]} == {*names[:2]}
     moves = table(out / "moves.csv")
     assert tuple(moves[0]) == MOVE_RECORD_FIELDS
-    for name, found in summary["setups"].items():
-        rows = [row for row in moves if row["setup"] == name]
-        assert found["moves"] == len(rows) > 0
-        assert found["planned"] == sum(row["result"] == PLANNED for row in rows) > 0
-        for group in ("object_class", "resting_side"):
-            assert found["groups"][group] == {
-                value: {
-                    "moves": sum(row[group] == value for row in rows),
-                    "planned": sum(
-                        row[group] == value and row["result"] == PLANNED for row in rows
-                    ),
-                }
-                for value in {row[group] for row in rows}
-            }
-        for parts in found["groups"].values():
-            assert sum(part["moves"] for part in parts.values()) == len(rows)
+    for setup in summary["setups"][:2]:
+        rows = [row for row in moves if row["setup"] == setup["name"]]
+        possible = [row for row in rows if row["possible"] == "True"]
+        assert setup["legal"] == len(rows)
+        assert setup["possible"] == len(possible) > 0
+        assert setup["planned"] == sum(row["result"] == PLANNED for row in rows) > 0
+        assert sum(setup["impossible"].values()) == len(rows) - len(possible)
+        for parts in setup["groups"].values():
+            assert sum(part["possible"] for part in parts.values()) == len(possible)
+        assert setup["sequences"]["scenes"] == 1
     assert {row["scene"] for row in moves} == {"pile"}
-    assert len(table(out / "bases.csv")) == 4
-    assert {(row["setup"], row["target"]) for row in table(out / "targets.csv")} == {
-        (name, "up") for name in summary["setups"]
-    }
+    found = {(row["setup"], row["target"], row["reachable"]) for row in table(out / "targets.csv")}
+    assert found == {(name, "up", "True") for name in names[:2]}
     page = (out / "report.html").read_text()
-    assert page.count("data:image/png;base64") >= 10
+    assert page.count("data:image/png;base64") >= 8
     assert "http:" not in page
     assert "https:" not in page
     # Existing parts are kept, and missing ones are computed.
-    monkeypatch.setattr(command, "write_feasibility_report", lambda *_: None)
+    monkeypatch.setattr("drake_clutter.commands.feasibility_run.write_feasibility_report", len_3)
     before = {path.name: path.stat().st_mtime_ns for path in (out / "parts").iterdir()}
-    (gone := next(path for path in (out / "parts").iterdir() if "scene_0001" in path.name)).unlink()
-    result = CliRunner().invoke(app, [*arguments, "--targets", str(targets)])
+    gone = out / "parts" / "moves_0000_scene_0001.json"
+    gone.unlink()
+    result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     after = {path.name: path.stat().st_mtime_ns for path in (out / "parts").iterdir()}
     assert {name for name in after if after[name] != before[name]} == {gone.name}
     result = CliRunner().invoke(app, [*arguments, "--seed", "1"])
     assert isinstance(result.exception, InputError)
     assert "holds results of other options" in str(result.exception)
+
+
+def len_3(*arguments: Any) -> int:
+    return len(arguments)
 
 
 def test_a_study_of_other_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -306,10 +582,10 @@ def test_a_study_of_other_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     setups = json.loads((out / "summary.json").read_text())["setups"]
-    assert set(setups) == set(names)
-    for found in setups.values():
-        assert found["planned"] > 0
-        assert set(found["results"]) <= {PLANNED, PlanningFailureReason.NO_FREE_PLACEMENT.value}
+    assert {setup["name"] for setup in setups} == {*names}
+    for setup in setups:
+        assert setup["planned"] == setup["possible"] > 0
+        assert setup["home"]["is_given"]
     reach = table(out / "reach.csv")
     for name in names:
         of_setup = [row for row in reach if row["setup"] == name]
@@ -322,7 +598,7 @@ def test_a_study_of_other_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_the_tray_pose_is_the_inverse_of_the_base_pose() -> None:
     (one,) = command.make_setups([], [[0.4, 0.5, -0.3, 30.0]], [], DEFAULT_CELL).values()
-    X_BT = one.robot.X_TB.inverse().GetAsMatrix4()
+    X_BT = one.cell.robot.X_TB.inverse().GetAsMatrix4()
     assert X_BT[:3, 3] == pytest.approx([0.4, 0.5, -0.3])
     assert math.degrees(math.atan2(X_BT[1, 0], X_BT[0, 0])) == pytest.approx(30.0)
 
@@ -378,13 +654,11 @@ def test_a_cell_override_from_a_file(tmp_path: Path) -> None:
     path = tmp_path / "long.yaml"
     path.write_text("{base: [-0.7, 0.1, 0.3, 10], suction: {extension: 0.15}}")
     found: dict[str, Any] = command.make_setups([], [], [path], DEFAULT_CELL)
-    assert found == {
-        "long": cell_with(
-            *[
-                "robot.base.x=-0.7",
-                "robot.base.y=0.1",
-                "robot.base.yaw=10",
-                "gripper.extension=0.15",
-            ]
-        )
-    }
+    assert found["long"].cell == cell_with(
+        *[
+            "robot.base.x=-0.7",
+            "robot.base.y=0.1",
+            "robot.base.yaw=10",
+            "gripper.extension=0.15",
+        ]
+    )

@@ -5,17 +5,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import DEFAULT_CELL
+from feasibility_jobs import feasibility_job
 
-from drake_clutter.commands.feasibility_job import FeasibilityJob, _read_part
 from drake_clutter.commands.job_file import JOB_FILE, open_job_folder
-from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 
 
 def job(seed: int = 0) -> dict[str, Any]:
-    cells = {"default": DEFAULT_CELL}
-    return FeasibilityJob((Path("/scene.yaml"),), cells, (), seed, ClutterConfig(), None).to_dict()
+    return feasibility_job(Path("/scene.yaml"), seed).to_dict()
 
 
 def test_the_same_job_is_resumed_and_another_refused(tmp_path: Path) -> None:
@@ -83,18 +80,6 @@ def test_a_study_of_version_0_1_is_refused(tmp_path: Path) -> None:
         open_job_folder(tmp_path, job()),
     ):
         pass
-
-
-def test_a_part_of_version_0_1_is_read(tmp_path: Path) -> None:
-    path = tmp_path / "part.json"
-    path.write_text(
-        '{"share": [1.0], "noise": [], "targets": [{"branches": 2, "in_the_way": "table"}]}'
-    )
-    assert _read_part(path) == {
-        "reachable_fraction": [1.0],
-        "pose_errors": [],
-        "targets": [{"num_solutions": 2, "blocking_bodies": "table"}],
-    }
 
 
 def test_images_of_version_0_1_are_extended(tmp_path: Path) -> None:

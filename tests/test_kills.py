@@ -47,7 +47,7 @@ LONG = {
     ),
     "run": (CLI, "run", "--set", "scene=SCENE", "--set", "agent=random", "--out", "OUT"),
     "export": (CLI, "export", "SCENE", "--format", "sdf", "--out", "OUT"),
-    "feasibility": (CLI, "feasibility", "SCENE", "--out", "OUT"),
+    "feasibility": (CLI, "feasibility", "SCENE", "--no-maps", "--out", "OUT"),
     "images": ("training.render_image_dataset", "--count", "20", "--out", "OUT"),
     "scene dataset": (
         *("training.generate_scene_dataset", "--agent", "random", "--nodes", "10", "--count", "2"),

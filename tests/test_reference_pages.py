@@ -5,12 +5,14 @@ from pathlib import Path
 
 import numpy as np
 from conftest import DEFAULT_CELL, resting, scene_of
-from drake_clutter.tasks.feasibility_study import MOVE_RECORD_FIELDS
 from test_floors import FLOORS
 
 from drake_clutter import ClutterConfig, run_episode
 from drake_clutter.agents.explorers import random_explorer
 from drake_clutter.commands.explore_scene import episode_to_dict
+from drake_clutter.feasibility.move_study import MOVE_RECORD_FIELDS
+from drake_clutter.feasibility.pose_noise import NOISE_RECORD_FIELDS
+from drake_clutter.feasibility.sequences import SEQUENCE_RECORD_FIELDS
 from drake_clutter.planning.pick_place_plan import PlanningFailureReason
 from drake_clutter.scenes.interfaces import MoveResult
 from drake_clutter.scenes.scene_file import scene_to_dict
@@ -66,6 +68,8 @@ def test_trajectory_file() -> None:
 def test_feasibility_study() -> None:
     page = "reference/feasibility_study.md"
     assert first_column(page, "### `moves.csv`") == [*MOVE_RECORD_FIELDS]
+    assert first_column(page, "### `noise.csv`") == [*NOISE_RECORD_FIELDS]
+    assert first_column(page, "### `sequences.csv`") == [*SEQUENCE_RECORD_FIELDS]
 
 
 def test_planning_failures() -> None:

@@ -172,10 +172,9 @@ class FeasibilityStudy:
         """
         legal = find_legal_moves(scene, self._config, self._seed, index)
         records = [self._plan_move(name, scene, move) for move in legal]
-        # The same moves in every setup, whether they are planned or not.
+        # The same moves in every setup in which the same moves are possible.
         order = item_rng(self._seed, index, len(legal)).permutation(len(legal)).tolist()
-        placed = [k for k in order if legal[k].command is not None][:MAX_OPTIMIZED_MOVES]
-        for k in placed:
+        for k in [k for k in order if records[k].possible][:MAX_OPTIMIZED_MOVES]:
             if records[k].result == PLANNED:
                 records[k] = replace(records[k], cycle_s=self._cycle_time(scene, legal[k]))
         return records
