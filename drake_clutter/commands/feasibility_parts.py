@@ -27,6 +27,7 @@ from drake_clutter.feasibility.reach_map import TILTS_DEG, ReachabilityAnalysis
 from drake_clutter.feasibility.sequences import SequenceRecord, search_scene
 from drake_clutter.feasibility.setups import Setup, SetupRequest, UnusableSetup, prepare_setup
 from drake_clutter.files import read_json
+from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.seeding import item_rng
@@ -110,6 +111,7 @@ class FeasibilityWorker:
         self._load_scene = cache(lambda index: load_settled_scene(job.scenes[index], job))
         self._grids = cache(lambda: make_base_grids(job.reference, job.searches))
         self._maps = cache(self._load_maps)
+        self._detector = LabelDetector(job.reference.camera)
 
     def __call__(self, part: StudyPart) -> dict[str, Any]:
         """Return the result of a part as a JSON document."""
@@ -165,7 +167,9 @@ class FeasibilityWorker:
         assert part.scene_index is not None
         grid: BaseGrid = self._grids()[part.index]
         config = replace(self._job.config, cell=grid.cell)
-        moves = find_legal_moves(scene, config, self._job.seed, part.scene_index)
+        moves = find_legal_moves(
+            scene, self._detector, config, self._job.seed, part.scene_index
+        )
         counts, total = count_reachable_moves(grid, self._maps(part.index), scene, moves)
         return {"possible": total, "reachable": counts.tolist()}
 

@@ -6,14 +6,12 @@ Frames: T the support (tray), O an object, G the gripper.
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_clutter.catalog import Shape
-from drake_clutter.cell.camera import Camera
 from drake_clutter.config import ClutterConfig
 from drake_clutter.feasibility.margins import compute_margins
 from drake_clutter.perception.label_detector import LabelDetector
@@ -160,6 +158,7 @@ class FeasibilityStudy:
         self._setup = setup
         self._config = config
         self._seed = seed
+        self._detector = LabelDetector(config.cell.camera)
         self._planners: dict[bool, PickPlacePlanner] = {}
 
     def plan_all_moves(self, name: str, index: int, scene: Scene) -> list[MoveRecord]:
@@ -170,7 +169,7 @@ class FeasibilityStudy:
             index: Index of the scene, from which the placements are seeded.
             scene: The scene, at rest.
         """
-        legal = find_legal_moves(scene, self._config, self._seed, index)
+        legal = find_legal_moves(scene, self._detector, self._config, self._seed, index)
         records = [self._plan_move(name, scene, move) for move in legal]
         # The same moves in every setup in which the same moves are possible.
         order = item_rng(self._seed, index, len(legal)).permutation(len(legal)).tolist()
@@ -267,7 +266,7 @@ def _plan_columns(plan: PickPlacePlan, planner: PickPlacePlanner) -> dict[str, A
 
 
 def find_legal_moves(
-    scene: Scene, config: ClutterConfig, seed: int, index: int
+    scene: Scene, detector: LabelDetector, config: ClutterConfig, seed: int, index: int
 ) -> tuple[LegalMove, ...]:
     """Return the legal moves of a scene with their places.
 
@@ -275,11 +274,12 @@ def find_legal_moves(
 
     Args:
         scene: The scene, at rest.
-        config: Configuration with the work cell.
+        detector: Detector with the first camera.
+        config: Configuration of the simulated world.
         seed: Seed of the placements.
         index: Index of the scene, from which the placements are seeded.
     """
-    observation = _detector(config.cell.camera).perceive(scene).observation
+    observation = detector.perceive(scene).observation
     return tuple(
         LegalMove(
             move,
@@ -287,11 +287,6 @@ def find_legal_moves(
         )
         for k, move in enumerate(legal_moves(observation))
     )
-
-
-@lru_cache(maxsize=4)
-def _detector(camera: Camera) -> LabelDetector:
-    return LabelDetector(camera)
 
 
 def resting_side(o: SceneObject) -> str:
