@@ -167,9 +167,7 @@ class FeasibilityWorker:
         assert part.scene_index is not None
         grid: BaseGrid = self._grids()[part.index]
         config = replace(self._job.config, cell=grid.cell)
-        moves = find_legal_moves(
-            scene, self._detector, config, self._job.seed, part.scene_index
-        )
+        moves = find_legal_moves(scene, self._detector, config, self._job.seed, part.scene_index)
         counts, total = count_reachable_moves(grid, self._maps(part.index), scene, moves)
         return {"possible": total, "reachable": counts.tolist()}
 

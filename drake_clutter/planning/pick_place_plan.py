@@ -46,6 +46,7 @@ class PlanningFailureReason(Enum):
     PLACE_UNSUPPORTED = "place without support"
     PLACE_OFF_BALANCE = "place off balance"
     UNREACHABLE = "unreachable"
+    HOME_IN_COLLISION = "home in collision"
     IN_COLLISION = "in collision"
     TRAJECTORY_INFEASIBLE = "trajectory infeasible"
     JOINT_LIMIT = "joint limit"

@@ -482,9 +482,12 @@ class PickPlacePlanner:
         if not pairs:
             return None
         nearest = min(pairs, key=lambda pair: pair.distance)
-        name = "at home" if (q == self.robot.home).all() else name
-        detail = f"{name}: {' and '.join(nearest.pair)}"
-        return PlanningFailure(PlanningFailureReason.IN_COLLISION, detail, nearest.distance)
+        pair = " and ".join(nearest.pair)
+        if (q == self.robot.home).all():
+            reason = PlanningFailureReason.HOME_IN_COLLISION
+            return PlanningFailure(reason, pair, nearest.distance)
+        reason = PlanningFailureReason.IN_COLLISION
+        return PlanningFailure(reason, f"{name}: {pair}", nearest.distance)
 
     def _to_configuration(self, q: Sequence[float], name: str) -> Floats:
         """Return joint positions as an array, or raise an error if their number is wrong."""
