@@ -487,7 +487,7 @@ def feasibility_parts(folder: Path) -> Reader:
     row = {k: None if v != v else v for k, v in move.items()}  # NaN is null
     noise = to_plain(NoiseRecord("setup", "scene", "a", "tray", "pose", 0.01, "placed", "b"))
     sequence = SequenceRecord("setup", "scene", "random", False, 3, 2, 4, 1, 0.5, "gave up")
-    grid = [[[[0.5, None], [1.0, 0.0]]]]
+    grid = [[[[0.5, 0.2], [1.0, 0.0]]]]
     target = {
         **{"setup": "setup", "target": "up", "num_solutions": 0, "reachable": False},
         **{"singular_value": 0.0, "q": None, "obstacles": ""},
