@@ -2,10 +2,11 @@
 
 import math
 
+import numpy as np
 import pytest
-from conftest import CLASSES, DEFAULT_CELL, cell_with, resting
+from conftest import CLASSES, DEFAULT_CELL, cell_with, resting, scene_of
 
-from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
 from drake_clutter.planning.pick_place_plan import (
@@ -16,8 +17,10 @@ from drake_clutter.planning.pick_place_plan import (
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.place_check import check_place, resting_tilt
 from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.resources import resource_path
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.scene import Pose, SceneObject
+from drake_clutter.station.station_simulation import StationSimulation
 
 BOX = resting("sugar_box", Orientation.UPRIGHT_0)
 """92 x 44 x 175 mm."""
@@ -146,6 +149,40 @@ def test_a_box_may_bridge_two_others() -> None:
     alone = check("cracker_box", bridge, objects=[beam, pillars[0]])
     assert alone is not None
     assert alone.reason is PlanningFailureReason.PLACE_OFF_BALANCE
+
+
+@pytest.mark.parametrize(
+    ("pick", "X_TO"),
+    [
+        ("sugar_box", tilted(BOX, 4.9, (0.2, -0.2))),
+        ("sugar_box", Pose((0.2, -0.2, HEIGHT - 0.0004), BOX.X_TO.quaternion)),
+        (
+            "tomato_soup_can",
+            Pose((-0.1, 0.176, CRACKERS.top_height + CAN.X_TO.p[2] + 0.0049)),
+        ),
+    ],
+)
+def test_odd_places_that_pass_are_carried_out(pick: str, X_TO: Pose) -> None:
+    """Tilted, 0.4 mm inside the floor, dropped by 5 mm at an edge: nothing is thrown."""
+    found = plan(X_TO, pick)
+    assert isinstance(found, PickPlacePlan)
+    result = StationSimulation(DEFAULT_CELL, scene_of(*SCENE)).execute(found)
+    assert result.grasped
+    assert np.linalg.norm(result.poses[pick].p - X_TO.p) < 0.015
+    assert max(result.displacements.values()) < 0.001
+
+
+def test_a_descent_that_does_not_reach_what_is_below_is_refused() -> None:
+    """Jaws have no guarded descent: they do not yield at contact."""
+    cell = load_cell(resource_path("models/cells/ur10_2f85_tray.yaml"))
+    config = PlannerConfig(optimize=False, max_guarded_descent=0.08)
+    above = Pose((0.2, -0.2, HEIGHT + 0.03), BOX.X_TO.quaternion)
+    found = PickPlacePlanner(cell, config).plan([BOX], BOX.name, above)
+    assert isinstance(found, PlanningFailure)
+    assert found.reason is PlanningFailureReason.PLACE_UNSUPPORTED
+    lowered = PickPlacePlanner(DEFAULT_CELL, config).plan([BOX], BOX.name, above)
+    assert isinstance(lowered, PickPlacePlan)
+    assert lowered.max_descent > 0.03
 
 
 def test_fixtures_are_solids_and_supports() -> None:

@@ -45,6 +45,8 @@ from drake_clutter.simulation.scene_plant import pose_from_transform, rigid_tran
 
 Floats = NDArray[np.float64]
 
+_DESCENT_TOLERANCE = 0.001
+"""A guarded descent that falls short by less reaches what it is planned for [m]."""
 _JOINT_TOLERANCE = 1e-6
 """Joint positions may differ by this from what is asked for [rad]."""
 
@@ -173,6 +175,13 @@ class PickPlacePlanner:
             )
             if plan.max_descent >= offset:
                 break
+        if plan.max_descent < self.config.max_guarded_descent:
+            model = self.collision_model(objects, occluded)
+            failure = self._check_place(
+                model, objects, picked, plan.X_TO_place, plan.max_descent + _DESCENT_TOLERANCE
+            )
+            if failure is not None:
+                return replace(failure, planning_time=time.perf_counter() - start_time)
         return plan
 
     def plan_pick(
@@ -452,7 +461,9 @@ class PickPlacePlanner:
             ):
                 return failure
         if goal.releases and goal.X_TO_place is not None:
-            return self._check_place(model, state.objects, goal.picked, goal.X_TO_place)
+            # Of the motions that end with a release, only `plan` has a guarded descent.
+            max_drop = self.config.max_guarded_descent if state.held is None else 0.0
+            return self._check_place(model, state.objects, goal.picked, goal.X_TO_place, max_drop)
         return None
 
     def _check_start(self, state: CellState) -> PlanningFailure | None:
@@ -512,11 +523,12 @@ class PickPlacePlanner:
         objects: Sequence[SceneObject],
         picked: SceneObject,
         X_TO_place: Pose,
+        max_drop: float,
     ) -> PlanningFailure | None:
         """Return why the object cannot be released at a pose, see `check_place`."""
         others = [o for o in objects if o is not picked]
         placed = replace(picked, X_TO=X_TO_place)
-        return check_place(placed, others, model, self.config.max_guarded_descent)
+        return check_place(placed, others, model, max_drop)
 
     def _search(
         self,
@@ -595,7 +607,8 @@ class PickPlacePlanner:
         if objects_resting_on(picked, objects) or isinstance(grasps, PlanningFailure):
             return False
         model = self.collision_model(objects)
-        if self._check_place(model, objects, picked, X_TO_place) is not None:
+        max_drop = self.config.max_guarded_descent
+        if self._check_place(model, objects, picked, X_TO_place, max_drop) is not None:
             return False
         goal = MoveGoal(picked, X_TO_place, self.config.lift_height, True, self.robot.home)
         search = self._search(model, self.home_state(objects), goal)
