@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from markdown_text import number, quantiles, section, significant, table
-from results_files import read_benchmark_results
+from results_files import has_benchmark_results, read_benchmark_results
 
 RUNS = (
     ("arm_moves.json", "SNOPT, 5 ms"),
@@ -12,6 +12,8 @@ RUNS = (
     ("arm_moves_convex.json", "convex, 2.5 ms"),
 )
 """Results files of random moves, with trajectory optimizer and simulation time step."""
+PEERS = "planner_peers.json"
+"""Results file of `benchmarks/planner_peers.py`."""
 GRASPS = {"JointHold": "weld (locked joint)", "HexapodHold": "compliant (hexapod)"}
 """Grasp constraints by their names in results files of version 0.1."""
 OUTCOMES = {"carried out": "executed"}
@@ -216,6 +218,47 @@ def _grippers() -> str:
     )
 
 
+def _peers() -> str:
+    results = read_benchmark_results(PEERS)
+    text = section(
+        "Transfer motions of several planners",
+        f"{results['count']} motions that carry an object between two poses above a pile of the "
+        "random generator (25 nodes), with a vertical tool, on one core. Start, goal, limits and "
+        "collision model are the same for all. Paths of OMPL are simplified and parameterized like "
+        "ours; callbacks of the peers are Python. `KTO` is Drake's "
+        "`KinematicTrajectoryOptimization`. Ours also keeps a distance for the sag of the load and "
+        "for what may be hidden below the object. *All plan*: the "
+        f"{results['planned_by_all']} motions that every planner finds.",
+        command=f"python {results['command']} --out FILE",
+        seed="3500 (`benchmarks/planning_problems.py`)",
+        results=[f"benchmarks/results/{PEERS}"],
+    )
+    body = [
+        [
+            row["planner"],
+            _fraction(row["planned"]),
+            number(1000 * row["seconds"]["p50"], 1),
+            number(1000 * row["seconds"]["p95"], 1),
+            number(row["duration_s"]["p50"]),
+            number(row["duration_s"]["p95"]),
+            number(row["duration_if_all_plan_s"]["p50"]),
+            number(1000 * row["least_clearance_m"], 1),
+        ]
+        for row in results["rows"]
+    ]
+    columns = [
+        "planner",
+        "planned",
+        "planning, median [ms]",
+        "planning, 95 % [ms]",
+        "motion, median [s]",
+        "motion, 95 % [s]",
+        "motion if all plan, median [s]",
+        "least clearance [mm]",
+    ]
+    return text + table(columns, body)
+
+
 def page() -> str:
     """Return the page."""
     intro = (
@@ -223,4 +266,7 @@ def page() -> str:
         "([motion planning](../explanation/motion_planning.md), "
         "[arm simulation](../explanation/arm_simulation.md)). Intervals are 95 %.\n\n"
     )
-    return intro + "\n".join([_moves(), _limits(), _parts(), _grasps(), _grippers()])
+    sections = [_moves(), _limits(), _parts(), _grasps(), _grippers()]
+    if has_benchmark_results(PEERS):
+        sections.append(_peers())
+    return intro + "\n".join(sections)

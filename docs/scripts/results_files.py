@@ -74,6 +74,11 @@ def read_training_results(name: str) -> dict[str, Any]:
     return content
 
 
+def has_benchmark_results(name: str) -> bool:
+    """Return whether there is a results file in `benchmarks/results`."""
+    return (BENCHMARKS / name).exists()
+
+
 def read_benchmark_results(name: str) -> Any:
     """Return the content of a file of benchmarks/results."""
     return with_current_keys(json.loads((BENCHMARKS / name).read_text(encoding="utf-8")))
