@@ -50,6 +50,15 @@ def test_a_leaning_box_is_put_down_flat(detector: LabelDetector) -> None:
     assert first.sum() > 3
     sideways = np.linalg.norm(lift[first] - np.outer(along[first], NORMAL), axis=1)
     assert (sideways < 0.2 * along[first]).all(), "along the normal first"
+    approach = plan.segments[0]
+    assert approach.duration < approach.unoptimized_duration
+    q = approach.trajectory.vector_values(np.linspace(0.0, approach.duration, 2000))
+    before = tool.pose(q.T)[:, :3, 3] - X_TG[0, :3, 3]
+    above = before @ NORMAL
+    last = (above > 1e-4) & (above < 0.0015)
+    assert last.sum() > 3
+    sideways = np.linalg.norm(before[last] - np.outer(above[last], NORMAL), axis=1)
+    assert (sideways < 0.2 * above[last]).all(), "along the normal last"
     result = StationSimulation(DEFAULT_CELL, SCENE).execute(plan)
     assert not result.lost_object
     assert result.position_error < 0.003

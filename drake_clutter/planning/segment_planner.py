@@ -42,7 +42,7 @@ from drake_clutter.planning.tool_kinematics import (
     raise_pose,
 )
 from drake_clutter.planning.trajectory_optimization import (
-    MIN_VERTICAL_TRAVEL,
+    MIN_AXIAL_TRAVEL,
     LinearizedDistances,
     TrajectoryOptimizationProblem,
     optimize_trajectory,
@@ -317,12 +317,15 @@ class SegmentPlanner:
             if segment is None:
                 return None
             segments[name] = segment
-        if self._config.optimize and not candidate.is_tilted:
-            segments = {
-                name: self._optimize_segment(segments[name], payload, candidate, endpoints)
-                for name, (_, payload) in candidates.items()
-            }
-        return segments
+        if not self._config.optimize:
+            return segments
+        # The load of a tilted grasp is planned for the tilts of its carry.
+        return {
+            name: segments[name]
+            if name == "carry" and candidate.is_tilted
+            else self._optimize_segment(segments[name], payload, candidate, endpoints)
+            for name, (_, payload) in candidates.items()
+        }
 
     def _paths_between(self, tool: ToolKinematics, q: Floats, q_end: Floats) -> Iterator[Floats]:
         """Yield candidate paths of an arm without an object. Shapes (m, n).
@@ -538,7 +541,7 @@ class SegmentPlanner:
             return LinearizedDistances(found.rows[varies], found.gradients[varies], slack[varies])
 
         height = self._column_clearance(candidate)
-        vertical = (0.0, height, height) if is_carry else MIN_VERTICAL_TRAVEL
+        distances = (0.0, height, height) if is_carry else MIN_AXIAL_TRAVEL
         starts_at_object = segment.name == "retreat" or (is_carry and self._start is not None)
         ends_at_object = segment.name == "approach" or (is_carry and self._releases)
         has_columns = is_carry and (starts_at_object or ends_at_object)
@@ -546,8 +549,8 @@ class SegmentPlanner:
         problem = TrajectoryOptimizationProblem(
             initial_trajectory=segment.trajectory,
             robot=self._robot,
-            vertical_start=vertical if starts_at_object else (),
-            vertical_end=vertical if ends_at_object else (),
+            departure_distances=distances if starts_at_object else (),
+            arrival_distances=distances if ends_at_object else (),
             keep_tool_vertical=is_carry,
             max_tool_speed=limits.max_tool_speed,
             max_tool_acceleration=payload.max_axis_acceleration,

@@ -48,9 +48,9 @@ NUM_COLLISION_SAMPLES = 50
 second one."""
 CONVERGENCE_TOLERANCE = 0.02
 """Change of the control points [rad], and relative change of the duration, at convergence."""
-MIN_VERTICAL_TRAVEL = (0.0, 0.002)
-"""Heights of the first free control points above the grasp and the place pose, on the vertical line
-through it, if the tool holds nothing [m]: it leaves an object upwards."""
+MIN_AXIAL_TRAVEL = (0.0, 0.002)
+"""Distances of the first free control points from the grasp and the place pose, on the axis of the
+tool there, if it holds nothing [m]: it leaves an object along its axis."""
 ENDPOINT_FRACTION = 0.15
 """Fraction of the path at either end where distances below the required ones are not increased: the
 fixed endpoints leave no freedom there."""
@@ -125,9 +125,9 @@ class TrajectoryOptimizationProblem:
     Attributes:
         initial_trajectory: Collision-free, time-parameterized initial guess.
         robot: Robot with its joint limits.
-        vertical_start: Least heights above the start of the first free control points, which are on
-            the vertical line through it [m]; empty if the tool may move in any direction.
-        vertical_end: Likewise above the end, for the last free control points [m].
+        departure_distances: Least distances from the start of the first free control points, which
+            are on the axis of the tool there [m]; empty if it may move in any direction.
+        arrival_distances: Likewise from the end, for the last free control points [m].
         keep_tool_vertical: Whether the tool axis stays vertical.
         max_tool_speed: Largest speed of the tool [m/s]; infinite without a limit.
         max_tool_acceleration: Largest acceleration of the tool along each axis [m/s^2].
@@ -135,7 +135,7 @@ class TrajectoryOptimizationProblem:
             of shape (m, n) and the path parameters s in [0, 1] of shape (m,).
         column_distances: Returns the distances from the columns below a carried object, like
             `nearby_distances`, from joint positions of shape (m, n); they are also imposed at the
-            ends of the path, but for its vertical parts. None without an object.
+            ends of the path, but for its parts on the axes. None without an object.
         tool_jacobians: Returns the spatial Jacobians of the tool, angular rows first, shape
             (m, 6, n), from joint positions of shape (m, n).
         tool_axis: Returns the z axes of the tool in T, shape (m, 3), from joint positions of shape
@@ -144,8 +144,8 @@ class TrajectoryOptimizationProblem:
 
     initial_trajectory: Trajectory
     robot: RobotModel
-    vertical_start: tuple[float, ...]
-    vertical_end: tuple[float, ...]
+    departure_distances: tuple[float, ...]
+    arrival_distances: tuple[float, ...]
     keep_tool_vertical: bool
     max_tool_speed: float
     max_tool_acceleration: float
@@ -373,11 +373,11 @@ def _directional_matrix(weights: Floats, directions: Floats) -> sparse.csr_matri
     )
 
 
-def _is_vertical(problem: TrajectoryOptimizationProblem) -> NDArray[np.bool_]:
-    """Return which samples depend on control points on the vertical lines alone. Shape (m,)."""
+def _is_axial(problem: TrajectoryOptimizationProblem) -> NDArray[np.bool_]:
+    """Return which samples are on the axes of the tool at the ends. Shape (m,)."""
     num_spans = NUM_CONTROL_POINTS - _SPLINE_ORDER + 1
     spans = _SAMPLE_PARAMETERS * num_spans
-    num_start, num_end = len(problem.vertical_start), len(problem.vertical_end)
+    num_start, num_end = len(problem.departure_distances), len(problem.arrival_distances)
     return np.asarray((spans < num_start) | (num_spans - spans < num_end))
 
 
@@ -416,7 +416,7 @@ def _limit_constraints(
         constraints.add_distances(LinearizedDistances(index, gradients, slack), q)
     if problem.column_distances is not None:
         columns = problem.column_distances(q)
-        is_kept = ~_is_vertical(problem)[columns.rows]
+        is_kept = ~_is_axial(problem)[columns.rows]
         kept = LinearizedDistances(
             columns.rows[is_kept], columns.gradients[is_kept], columns.slack[is_kept]
         )
@@ -457,8 +457,8 @@ def _add_vertical_tool_constraints(
         subspaces: Subspaces to which the constraint is added.
     """
     rows = problem.robot.vertical_tool_rows
-    start = NUM_FIXED_CONTROL_POINTS + len(problem.vertical_start)
-    end = NUM_CONTROL_POINTS - NUM_FIXED_CONTROL_POINTS - len(problem.vertical_end)
+    start = NUM_FIXED_CONTROL_POINTS + len(problem.departure_distances)
+    end = NUM_CONTROL_POINTS - NUM_FIXED_CONTROL_POINTS - len(problem.arrival_distances)
     if rows is not None:
         subspaces.constrain(range(start, end), rows, rows @ points[0])
         return
@@ -472,13 +472,20 @@ def _add_vertical_tool_constraints(
         subspaces.constrain([k], tilts, tilts @ points[k] - [x, y])
 
 
-def _add_vertical_motion_constraints(
+def _basis_with(axis: Floats) -> Floats:
+    """Return a rotation matrix whose last row is a unit vector. Shapes (3, 3), (3,)."""
+    first = np.cross((0.0, 1.0, 0.0) if abs(axis[1]) < 0.9 else (1.0, 0.0, 0.0), axis)
+    first /= np.linalg.norm(first)
+    return np.array([first, np.cross(axis, first), axis])
+
+
+def _add_departure_constraints(
     problem: TrajectoryOptimizationProblem,
     points: Floats,
     subspaces: _ControlPointSubspaces,
     constraints: _LinearConstraints,
 ) -> None:
-    """Add the constraint that the tool moves vertically at the start and at the end.
+    """Add the constraint that the tool moves along its axis at the start and at the end.
 
     Args:
         problem: Trajectory optimization problem.
@@ -487,13 +494,15 @@ def _add_vertical_motion_constraints(
         constraints: Constraints to which inequalities are added.
     """
     for heights, end, inwards in (
-        (problem.vertical_start, 0, 1),
-        (problem.vertical_end, NUM_CONTROL_POINTS - 1, -1),
+        (problem.departure_distances, 0, 1),
+        (problem.arrival_distances, NUM_CONTROL_POINTS - 1, -1),
     ):
         if not heights:
             continue
         q = points[end]
         (J,) = problem.tool_jacobians(q[None])
+        away = -problem.tool_axis(q[None])[0]
+        J = np.vstack([J[:3], _basis_with(away) @ J[3:]])
         indices = end + inwards * (NUM_FIXED_CONTROL_POINTS + np.arange(len(heights)))
         subspaces.constrain(indices.tolist(), J[:5], J[:5] @ q)
         constraints.add(
@@ -523,7 +532,7 @@ def _solve_subproblem(
     n = problem.robot.num_joints
     subspaces = _ControlPointSubspaces(points)
     constraints = _limit_constraints(problem, points, duration)
-    _add_vertical_motion_constraints(problem, points, subspaces, constraints)
+    _add_departure_constraints(problem, points, subspaces, constraints)
     if problem.keep_tool_vertical:
         _add_vertical_tool_constraints(problem, points, subspaces)
     N, p_0 = subspaces.basis, subspaces.offset
