@@ -33,30 +33,39 @@ DOWN = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), [0.05, 0.1, 0.
 """X_TG of a cup that points down."""
 
 
-def hanging(offset: float, time_step: float) -> tuple[ClutterStation, Context, SceneObject]:
+def hanging(
+    offset: float,
+    time_step: float,
+    X_TG: RigidTransform = DOWN,
+    *,
+    attached: bool = True,
+) -> tuple[ClutterStation, Context, SceneObject]:
     """Return a station at rest whose arm holds the box, its context, and the box.
 
     Args:
         offset: Offset of the center of mass from the axis of the cup along y of G [m].
         time_step: Time step of the plant [s].
+        X_TG: Pose of the cup.
+        attached: Whether the box is attached to the cup.
     """
-    solutions = ToolKinematics(DEFAULT_CELL, CUP.name).solve_ik(DOWN.GetAsMatrix4())
+    solutions = ToolKinematics(DEFAULT_CELL, CUP.name).solve_ik(X_TG.GetAsMatrix4())
     q = solutions[~np.isnan(solutions).any(axis=1)][0]
     zero = np.zeros((1, 6))
     torques = arm_dynamics(DEFAULT_CELL, Payload()).inverse_dynamics(q[None], zero, zero)[0]
     station = ClutterStation(DEFAULT_CELL, [(BOX.name, BOX.object_class)], time_step=time_step)
     root = station.CreateDefaultContext()
-    R_GO = DOWN.rotation().inverse() @ RotationMatrix(BOX.X_TO.rotation)
-    X_TO = DOWN @ RigidTransform(R_GO, [0.0, offset, DEPTH])
+    R_GO = X_TG.rotation().inverse() @ RotationMatrix(BOX.X_TO.rotation)
+    X_TO = X_TG @ RigidTransform(R_GO, [0.0, offset, DEPTH])
     box = replace(BOX, X_TO=pose_from_transform(X_TO))
     station.set_state(root, q, [box])
     station.GetInputPort("command").FixValue(root, np.concatenate([q, np.zeros(6), torques]))
     gripper = station.GetInputPort("gripper_command")
     gripper.FixValue(root, np.zeros(gripper.size()))
     assert station.grasp is not None
-    station.grasp.attach(
-        station.plant_context(root), CUP.name, station.scene_plant.bodies[BOX.name]
-    )
+    if attached:
+        station.grasp.attach(
+            station.plant_context(root), CUP.name, station.scene_plant.bodies[BOX.name]
+        )
     return station, root, box
 
 

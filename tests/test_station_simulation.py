@@ -1,6 +1,7 @@
 """Station simulation: reset, steps, recordings and fixtures."""
 
 import gc
+import math
 import weakref
 from functools import partial
 from pathlib import Path
@@ -27,6 +28,7 @@ from drake_clutter.scenes.scene import Pose
 from drake_clutter.simulation.scene_plant import pose_from_transform
 from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.messages import PlannedMove
+from drake_clutter.station.pick_place_executor import EXECUTOR_UPDATE_PERIOD
 from drake_clutter.station.station_simulation import (
     STEP_PERIOD,
     TIME_STEP,
@@ -271,3 +273,24 @@ def test_a_released_simulation_leaves_no_memory_behind() -> None:
     for _ in range(3):  # what a generation holds is found one after the other
         gc.collect()
     assert station() is None
+
+
+@pytest.mark.parametrize(
+    ("time_constant", "waited"), [(0.05, 0.0), (0.2, 0.2 * math.log(5) - 0.15), (5.0, 0.475)]
+)
+def test_the_arm_waits_for_the_vacuum_before_it_lifts(time_constant: float, waited: float) -> None:
+    """80 % of the vacuum are reached after ln 5 time constants; the dwell is 0.15 s.
+
+    The vacuum is checked every 25 ms.
+    """
+    cell = cell_with(f"gripper.pump_time_constant={time_constant}")
+    simulation = StationSimulation(cell, SCENE, movable={"pudding_box"})
+    plan = planned(DEFAULT_CELL)
+    context = simulation.executor.GetMyMutableContextFromRoot(simulation.root)
+    simulation.executor.GetInputPort("plan").FixValue(context, PlannedMove(1, plan))
+    status = simulation.executor.GetOutputPort("status")
+    simulation.run_until(lambda: status.Eval(context).stage == "carry")
+    assert 0 <= simulation.executor_state.waited - waited <= 2 * EXECUTOR_UPDATE_PERIOD
+    vacuum = simulation.station.GetOutputPort("vacuum")
+    station_context = simulation.station.GetMyContextFromRoot(simulation.root)
+    assert (vacuum.Eval(station_context)[0] >= 0.8 * 0.8 * 101_325) == (time_constant < 5)

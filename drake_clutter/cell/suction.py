@@ -67,6 +67,14 @@ class SuctionGripper(StrictModel):
         max_tilt_deg: Largest angle between that plane and the plane of the unloaded lip which the
             bellows follow [deg].
         safety: Safety factor of the load capacity in planning.
+        pump_time_constant: Time constant with which the pump evacuates a sealed cup [s].
+        leak_time_constant: Time constant with which the vacuum is lost through a lip on a surface
+            at the limit of `unevenness` [s]; the rate of the leak grows with the unevenness.
+        loss_time_constant: Time constant with which the vacuum is lost through a lifted lip, and
+            through the valve that releases an object [s].
+        detection_vacuum: Vacuum from which on a cup holds an object [Pa].
+        lift_vacuum: Share of `vacuum` at which the arm lifts an object.
+        grip_timeout: Largest time for which the arm waits for that vacuum beyond the dwell [s].
     """
 
     kind: Literal["suction"] = "suction"
@@ -76,6 +84,12 @@ class SuctionGripper(StrictModel):
     unevenness: Annotated[float, InRange(0.0, 0.01)] = 0.001
     max_tilt_deg: Annotated[float, InRange(0.0, 45.0)] = 6.0
     safety: Annotated[float, InRange(1.0, 100.0)] = 1.5
+    pump_time_constant: Annotated[float, InRange(0.001, 10.0)] = 0.05
+    leak_time_constant: Annotated[float, InRange(0.001, 100.0)] = 1.0
+    loss_time_constant: Annotated[float, InRange(0.001, 10.0)] = 0.02
+    detection_vacuum: Annotated[float, InRange(1.0, 1e5)] = 10_000.0
+    lift_vacuum: Annotated[float, InRange(0.0, 1.0)] = 0.8
+    grip_timeout: Annotated[float, InRange(0.0, 10.0)] = 0.5
 
     @model_validator(mode="before")
     @classmethod
@@ -120,7 +134,56 @@ class SuctionGripper(StrictModel):
         Args:
             tool: Name of the cup.
         """
-        return self.vacuum * ATMOSPHERIC_PRESSURE * math.pi * self.cup(tool).diameter ** 2 / 4
+        return self.full_vacuum * self._lip_area(tool)
+
+    @property
+    def full_vacuum(self) -> float:
+        """Largest pressure difference of the pump [Pa]."""
+        return self.vacuum * ATMOSPHERIC_PRESSURE
+
+    def _lip_area(self, tool: str) -> float:
+        """Return the area inside the lip of a cup [m^2]."""
+        return math.pi * self.cup(tool).diameter ** 2 / 4
+
+    def leak_rate(self, tool: str, object_class: ObjectClass, X_OG: RigidTransform) -> float:
+        """Return the rate at which the vacuum of a cup at a pose leaks through the lip [1/s].
+
+        It is infinite if the lip does not seal.
+
+        Args:
+            tool: Name of the cup.
+            object_class: Class of the object below the lip.
+            X_OG: Pose of the cup in the object.
+        """
+        if not self.can_attach(tool, object_class, X_OG):
+            return math.inf
+        diameter = self.cup(tool).diameter
+        deviation = profile_deviation(lip_surface_profile(object_class, X_OG, diameter), diameter)
+        share = deviation / self.unevenness if self.unevenness > 0 else 0.0
+        return share / self.leak_time_constant
+
+    def next_vacuum(
+        self, vacuum: float, *, is_on: bool, leak_rate: float, duration: float
+    ) -> float:
+        """Return the vacuum of a cup after a time.
+
+        The pump takes away a volume per time that falls linearly to zero at `full_vacuum`; the leak
+        lets in air in proportion to the vacuum. The solution is an exponential. A lip that does not
+        seal short-circuits the pump.
+
+        Args:
+            vacuum: Vacuum at the start [Pa].
+            is_on: Whether the pump evacuates the cup; else the valve vents it.
+            leak_rate: See `leak_rate` [1/s].
+            duration: Time [s].
+        """
+        if is_on and math.isfinite(leak_rate):
+            pump_rate = 1 / self.pump_time_constant
+            rate = pump_rate + leak_rate
+            final_vacuum = self.full_vacuum * pump_rate / rate
+        else:
+            rate, final_vacuum = 1 / self.loss_time_constant, 0.0
+        return final_vacuum + (vacuum - final_vacuum) * math.exp(-rate * duration)
 
     @property
     def num_joints(self) -> int:
@@ -256,19 +319,23 @@ class SuctionGripper(StrictModel):
         cup = self.cup(tool)
         return min(mass * GRAVITY / cup.stiffness, cup.stroke)
 
-    def load_ratio(self, tool: str, force: Floats, moment: Floats) -> Floats:
+    def load_ratio(
+        self, tool: str, force: Floats, moment: Floats, vacuum: float | None = None
+    ) -> Floats:
         """Return the ratio of a load to the load capacity of a cup; it detaches above 1.
 
         Args:
             tool: Name of the cup.
             force: Force of the object on the cup, in G [N]. Shape (..., 3).
             moment: Moment of the object about G, in G [N m]. Shape (..., 3).
+            vacuum: Vacuum of the cup [Pa]; None for `full_vacuum`.
 
         Returns:
             The larger of the ratios of opening and of sliding. Shape (...).
         """
         radius = self.cup(tool).diameter / 2
-        holding_force = self.holding_force(tool)
+        vacuum = self.full_vacuum if vacuum is None else vacuum
+        holding_force = max(vacuum * self._lip_area(tool), 1e-9)
         bending = np.hypot(moment[..., 0], moment[..., 1])
         opening = np.maximum(force[..., 2] + 2 * bending / radius, 0.0) / holding_force
         normal_force = np.maximum(holding_force - force[..., 2], 1e-9)

@@ -31,6 +31,7 @@ from drake_clutter.station.grasp_constraint import (
     WeldGrasp,
     WeldPair,
 )
+from drake_clutter.station.vacuum_system import VacuumSystem
 
 Floats = NDArray[np.float64]
 
@@ -53,10 +54,12 @@ class ClutterStation(Diagram):
         input_ports:
         - command
         - gripper_command
+        - hold
         output_ports:
         - state
         - body_poses
         - gripper_state
+        - vacuum
         - query
 
     Input ports:
@@ -66,11 +69,15 @@ class ClutterStation(Diagram):
         gripper_command: Desired positions [m], then desired velocities [m/s] of the m actuated
             joints of the gripper. Shape (2 m,).
 
+        hold: See `VacuumSystem`. Only with suction cups.
+
     Output ports:
         state: State of the plant. Shape (num_multibody_states,).
         body_poses: Poses of all bodies of the plant in the world, a list of `RigidTransform`.
         gripper_state: Positions, then velocities of the gripper's k joints: of each suction cup the
             extension of the bellows [m, m/s] and two angles of bending [rad, rad/s]. Shape (2 k,).
+        vacuum: Pressure of each suction cup below the ambient pressure [Pa]. Only with suction
+            cups. Shape (num_cups,).
         query: `QueryObject` of `camera_scene_graph`. Only with visuals.
 
     Attributes:
@@ -81,6 +88,7 @@ class ClutterStation(Diagram):
         fixed_bodies: Bodies of the fixed objects, by name.
         plant: Plant of arm, cell and objects.
         arm: Frames and bodies of the arm in the plant.
+        vacuum_system: Vacuum of the suction cups; None for other grippers.
         grasp: Grasp constraint between a suction cup and an object; None for other grippers.
         free_joints: Free joint of each object that can be locked, by name.
         camera_scene_graph: Scene graph with the visual geometry for cameras; None without visuals.
@@ -155,6 +163,11 @@ class ClutterStation(Diagram):
         builder.ExportOutput(plant.get_state_output_port(), "state")
         builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")
         builder.ExportOutput(plant.get_state_output_port(self.arm.gripper), "gripper_state")
+        self.vacuum_system: VacuumSystem | None = None
+        if isinstance(cell.gripper, SuctionGripper):
+            self.vacuum_system = builder.AddNamedSystem("vacuum_system", VacuumSystem(cell.gripper))
+            builder.ExportInput(self.vacuum_system.GetInputPort("hold"), "hold")
+            builder.ExportOutput(self.vacuum_system.GetOutputPort("vacuum"), "vacuum")
         self.camera_scene_graph = self._add_camera_geometry(builder, objects) if visuals else None
         builder.BuildInto(self)
 

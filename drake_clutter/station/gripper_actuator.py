@@ -19,11 +19,8 @@ from drake_clutter.station.clutter_station import ClutterStation
 
 GRIPPER_UPDATE_PERIOD = 0.0125
 """Period at which the command and the load are checked [s]."""
-OVERLOAD_RELEASE_TIME = 0.02
-"""Duration of an overload after which the object detaches [s].
-
-Air leaks in during this time. Shorter peaks come from contacts.
-"""
+MAX_REGRIPS = 1
+"""Number of times that a cup may hold an object again that has come off while the pump is on."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +35,7 @@ class GraspStatus:
         max_load_ratio: Largest ratio of the load to the load capacity.
         slip: Displacement between object and gripper from attachment to release [m]; NaN before
             the release.
+        num_regrips: Number of times that an object was held again after it had come off.
     """
 
     tool: str = ""
@@ -46,6 +44,7 @@ class GraspStatus:
     release_time: float = math.nan
     max_load_ratio: float = 0.0
     slip: float = math.nan
+    num_regrips: int = 0
 
     @property
     def has_held(self) -> bool:
@@ -81,7 +80,9 @@ class GripperActuator(Protocol):
 class SuctionActuator:
     """Switches the grasp constraint between a suction cup and an object.
 
-    Only the cup that is commanded on has a vacuum.
+    Only the cup that is commanded on has a vacuum. It builds up while the lip seals on an object,
+    which is attached from `SuctionGripper.detection_vacuum` on. The lip lifts while the load is
+    above the capacity at the current vacuum; the object comes off when the vacuum is lost.
 
     Attributes:
         status: Status of the gripper.
@@ -104,7 +105,9 @@ class SuctionActuator:
         self._station = station
         self._gripper = gripper
         assert station.grasp is not None
+        assert station.vacuum_system is not None
         self._grasp = station.grasp
+        self._vacuum_system = station.vacuum_system
         self._commanded_tool = commanded_tool
         self.reset()
 
@@ -112,39 +115,59 @@ class SuctionActuator:
         """Reset the status, see `GripperActuator`."""
         self.status = GraspStatus()
         self._last_tool = ""
-        self._num_overloads = 0  # consecutive updates with overload
+        self._sealed_leak_rate = 0.0  # of the object that is held [1/s]
         self._X_OG = RigidTransform()  # at the last attachment
 
     def update(self, root: Context) -> None:
         """Attach or release an object, see `GripperActuator`."""
-        time = root.get_time()
         context = self._station.plant_context(root)
         tool = self._commanded_tool(root)
-        if self.status.held and tool != self.status.tool:
-            self._release(context)
         if tool and tool != self._last_tool:
+            if self.status.held:
+                self._release(context)
             self.status = GraspStatus(tool)
-            self._num_overloads = 0
         self._last_tool = tool
-        if tool and not self.status.held and not self.status.lost_object:
-            self._try_attach(context)
-        elif self.status.held:
-            self._check_overload(context, time)
+        leak_rate = math.inf
+        if self.status.held:
+            leak_rate = self._hold(context, root)
+        elif tool and self.status.num_regrips + self.status.lost_object <= MAX_REGRIPS:
+            leak_rate = self._try_attach(context, root)
+        rates = [leak_rate if name == self.status.tool else math.inf for name in self._names]
+        vacuum_context = self._vacuum_system.GetMyMutableContextFromRoot(root)
+        self._vacuum_system.set_leak_rates(vacuum_context, np.array(rates))
 
-    def _check_overload(self, context: Context, time: float) -> None:
-        """Release the object after an overload of `OVERLOAD_RELEASE_TIME`."""
+    @property
+    def _names(self) -> tuple[str, ...]:
+        return tuple(cup.name for cup in self._gripper.cups)
+
+    def _vacuum(self, root: Context) -> float:
+        """Return the vacuum of the cup of the status [Pa]."""
+        port = self._vacuum_system.GetOutputPort("vacuum")
+        values = port.Eval(self._vacuum_system.GetMyContextFromRoot(root))
+        return float(values[self._names.index(self.status.tool)])
+
+    def _hold(self, context: Context, root: Context) -> float:
+        """Check the load of the object that is held, and return the leak rate [1/s]."""
         tool = self.status.tool
-        force, moment = self._grasp.load(context, tool)
-        ratio = float(self._gripper.load_ratio(tool, force, moment))
-        max_ratio = max(self.status.max_load_ratio, ratio)
-        self.status = replace(self.status, max_load_ratio=max_ratio)
-        self._num_overloads = self._num_overloads + 1 if ratio > 1 else 0
-        if self._num_overloads * GRIPPER_UPDATE_PERIOD > OVERLOAD_RELEASE_TIME:
-            self.status = replace(self.status, release_time=time)
+        vacuum = self._vacuum(root)
+        if vacuum < self._gripper.detection_vacuum:
+            if self._last_tool == tool:
+                self.status = replace(self.status, release_time=root.get_time())
             self._release(context)
+            return math.inf
+        force, moment = self._grasp.load(context, tool)
+        ratio = float(self._gripper.load_ratio(tool, force, moment, vacuum))
+        if self._last_tool == tool:
+            max_ratio = max(self.status.max_load_ratio, ratio)
+            self.status = replace(self.status, max_load_ratio=max_ratio)
+        return math.inf if ratio > 1 else self._sealed_leak_rate
 
-    def _try_attach(self, context: Context) -> None:
-        """Attach the object that is closest below the lip, if the lip seals on it."""
+    def _try_attach(self, context: Context, root: Context) -> float:
+        """Attach the object that is closest below the lip, if it seals there and has a vacuum.
+
+        Returns:
+            Leak rate [1/s].
+        """
         station = self._station
         tool = self.status.tool
         diameter = self._gripper.cup(tool).diameter
@@ -157,12 +180,24 @@ class SuctionActuator:
             for name in X_OG
         }
         if not gaps:
-            return
+            return math.inf
         closest = min(gaps, key=lambda name: gaps[name])
-        if self._gripper.can_attach(tool, station.object_classes[closest], X_OG[closest]):
+        object_class = station.object_classes[closest]
+        if not self._gripper.can_attach(tool, object_class, X_OG[closest]):
+            return math.inf
+        leak_rate = self._gripper.leak_rate(tool, object_class, X_OG[closest])
+        if self._vacuum(root) >= self._gripper.detection_vacuum:
             self._grasp.attach(context, tool, station.scene_plant.bodies[closest])
-            self.status = replace(self.status, held=closest, last_held=closest)
+            self.status = replace(
+                self.status,
+                held=closest,
+                last_held=closest,
+                release_time=math.nan,
+                num_regrips=self.status.num_regrips + self.status.lost_object,
+            )
             self._X_OG = X_OG[closest]
+            self._sealed_leak_rate = leak_rate
+        return leak_rate
 
     def _release(self, context: Context) -> None:
         X_OG = self._station.tool_pose_in_object(context, self.status.tool, self.status.held)

@@ -11,9 +11,11 @@ from drake_clutter.cell.parallel_jaw import ParallelJawGripper
 from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.gripper_actuator import (
     GRIPPER_UPDATE_PERIOD,
-    OVERLOAD_RELEASE_TIME,
     GraspStatus,
 )
+
+CONTACT_LOSS_TIME = 0.02
+"""Time without contact after which the object is lost [s]; shorter ones are bounces."""
 
 
 class JawActuator:
@@ -71,7 +73,7 @@ class JawActuator:
         touched = set[str].intersection(*(set(by_object) for by_object in forces))
         if self.status.held and self.status.held not in touched:
             self._num_missing += 1
-            if self._num_missing * GRIPPER_UPDATE_PERIOD > OVERLOAD_RELEASE_TIME:
+            if self._num_missing * GRIPPER_UPDATE_PERIOD > CONTACT_LOSS_TIME:
                 self.status = replace(self.status, release_time=time)
                 self._release(context)
             return

@@ -16,6 +16,7 @@ from pydrake.systems.framework import (
 )
 
 from drake_clutter.cell.gripper import Payload
+from drake_clutter.cell.suction import SuctionGripper
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.arm_dynamics import arm_dynamics
 from drake_clutter.planning.motion_plan import Plan
@@ -49,6 +50,7 @@ class ExecutorState(Message):
             before.
         contact_time: Time between the start of the guarded descent and contact [s]; infinite
             without contact.
+        waited: Time for which the arm has waited for the vacuum, beyond the planned dwell [s].
     """
 
     plan: Plan | None = None
@@ -56,6 +58,7 @@ class ExecutorState(Message):
     start_time: float = 0.0
     bellows_extension: float = math.nan
     contact_time: float = math.inf
+    waited: float = 0.0
 
     @property
     def lowered_distance(self) -> float:
@@ -65,13 +68,13 @@ class ExecutorState(Message):
         return self.plan.guarded_descent.depth_at(self.contact_time)
 
     def elapsed(self, time: float) -> float:
-        """Return the time since the start of the plan, at most its duration [s].
+        """Return the time since the start of the plan without `waited`, at most its duration [s].
 
         Args:
             time: Simulation time [s].
         """
         assert self.schedule is not None
-        return min(time - self.start_time, self.schedule.end_time)
+        return min(time - self.start_time - self.waited, self.schedule.end_time)
 
     def has_ended(self, time: float) -> bool:
         """Return whether no plan is executed.
@@ -79,7 +82,9 @@ class ExecutorState(Message):
         Args:
             time: Simulation time [s].
         """
-        return self.schedule is None or time >= self.start_time + self.schedule.end_time
+        if self.schedule is None:
+            return True
+        return time >= self.start_time + self.waited + self.schedule.end_time
 
 
 class PickPlaceExecutor(LeafSystem):
@@ -93,6 +98,7 @@ class PickPlaceExecutor(LeafSystem):
         input_ports:
         - plan
         - gripper_state
+        - vacuum
         output_ports:
         - command
         - gripper_command
@@ -105,6 +111,9 @@ class PickPlaceExecutor(LeafSystem):
         gripper_state: Positions, then velocities of the gripper's k joints. A guarded
             descent ends when the bellows of the tool are compressed, or at its planned end. Shape
             (2 k,).
+        vacuum: Vacuum of each suction cup [Pa]; only with suction cups. The arm does not lift an
+            object before `SuctionGripper.lift_vacuum`, or `grip_timeout` later than planned. Shape
+            (num_cups,).
 
     Output ports:
         command: Desired positions [rad], desired velocities [rad/s] and feed-forward torques [N m]
@@ -137,6 +146,8 @@ class PickPlaceExecutor(LeafSystem):
         self._gripper_state = self.DeclareVectorInputPort(
             "gripper_state", 2 * cell.gripper.num_joints
         )
+        if isinstance(cell.gripper, SuctionGripper):
+            self._vacuum = self.DeclareVectorInputPort("vacuum", len(self._tools))
         self._state = self.DeclareAbstractState(AbstractValue.Make(ExecutorState()))
         self.DeclarePeriodicUnrestrictedUpdateEvent(EXECUTOR_UPDATE_PERIOD, 0.0, self._update)
         self.DeclareInitializationUnrestrictedUpdateEvent(self._update)
@@ -172,7 +183,7 @@ class PickPlaceExecutor(LeafSystem):
     def _update(self, context: Context, state: State) -> EventStatus:
         current = self.state(context)
         time = context.get_time()
-        updated = self._detect_contact(context, current)
+        updated = self._await_vacuum(context, self._detect_contact(context, current))
         has_input = self._plan.HasValue(context)
         move: PlannedMove = self._plan.Eval(context) if has_input else PlannedMove()
         is_new = move.plan is not None and move.number != current.number
@@ -182,6 +193,26 @@ class PickPlaceExecutor(LeafSystem):
         if updated is not current:
             state.get_mutable_abstract_state(int(self._state)).set_value(updated)
         return EventStatus.Succeeded()
+
+    def _await_vacuum(self, context: Context, state: ExecutorState) -> ExecutorState:
+        """Return the state, delayed if a grasp is about to end without enough vacuum."""
+        gripper, schedule = self._cell.gripper, state.schedule
+        if (
+            not isinstance(gripper, SuctionGripper)
+            or schedule is None
+            or not self._vacuum.HasValue(context)
+            or state.waited + EXECUTOR_UPDATE_PERIOD > gripper.grip_timeout
+        ):
+            return state
+        elapsed = state.elapsed(context.get_time())
+        tool = schedule.tool_at(elapsed)
+        ends_before_next_update = schedule.stage_at(elapsed + EXECUTOR_UPDATE_PERIOD) != "grasp"
+        if schedule.stage_at(elapsed) != "grasp" or not tool or not ends_before_next_update:
+            return state
+        vacuum = float(self._vacuum.Eval(context)[list(self._tools).index(tool)])
+        if vacuum >= gripper.lift_vacuum * gripper.full_vacuum:
+            return state
+        return replace(state, waited=state.waited + EXECUTOR_UPDATE_PERIOD)
 
     def _detect_contact(self, context: Context, state: ExecutorState) -> ExecutorState:
         """Return the state, updated if contact occurs during a guarded descent."""
@@ -198,7 +229,7 @@ class PickPlaceExecutor(LeafSystem):
             return state
         descent_start = schedule.start_of("descend")
         descent_duration = schedule.release_time - descent_start
-        descent_time = context.get_time() - state.start_time - descent_start
+        descent_time = state.elapsed(context.get_time()) - descent_start
         is_descending = 0 < descent_time < descent_duration
         if not is_descending or math.isfinite(state.contact_time):
             return state

@@ -181,10 +181,16 @@ class StationSimulation:
             ),
         )
         self.executor = PickPlaceExecutor.AddToBuilder(builder, cell=self.cell)
+        suction = (
+            [(self.executor, self.station, "hold"), (self.station, self.executor, "vacuum")]
+            if self.station.vacuum_system is not None
+            else []
+        )
         for source, target, port in (
             (self.executor, self.station, "command"),
             (self.executor, self.station, "gripper_command"),
             (self.station, self.executor, "gripper_state"),
+            *suction,
         ):
             builder.Connect(source.GetOutputPort(port), target.GetInputPort(port))
         if add_systems is not None:
@@ -221,8 +227,9 @@ class StationSimulation:
         Systems written in Python and the diagram that owns them refer to each other through C++,
         which the garbage collector does not see.
         """
-        for system in (self.station, self.executor):
-            system.__dict__.clear()
+        for system in (self.station.vacuum_system, self.station, self.executor):
+            if system is not None:
+                system.__dict__.clear()
 
     @property
     def root(self) -> Context:
@@ -272,7 +279,7 @@ class StationSimulation:
             if state.number != self._affected_plan:
                 self._affected_plan = state.number
                 self._affected = affected_bodies(self.scene.objects, state.plan)
-            elapsed = self.root.get_time() - state.start_time
+            elapsed = self.root.get_time() - state.start_time - state.waited
             required = bodies_to_wake(state.schedule, self._affected, elapsed)
             end = state.schedule.end_time + POST_MOTION_WAIT
             expects_grasp = state.schedule.grasp_time + STEP_PERIOD <= elapsed < end
@@ -324,7 +331,7 @@ class StationSimulation:
                 return False
             state = self.executor_state
             assert state.schedule is not None
-            end = state.start_time + state.schedule.end_time
+            end = state.start_time + state.waited + state.schedule.end_time
             return self._num_steps * STEP_PERIOD >= end + SETTLE_TIME
 
         while not has_settled():
