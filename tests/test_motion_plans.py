@@ -1,5 +1,6 @@
 """Motions between any states of the cell: picks, places, moves and their sequences."""
 
+import math
 from dataclasses import replace
 from itertools import pairwise
 
@@ -18,6 +19,7 @@ from drake_clutter.grammar import Orientation
 from drake_clutter.planning.cubic_spline import CubicSpline
 from drake_clutter.planning.motion_limits import CHECK_PERIOD, MotionLimits
 from drake_clutter.planning.motion_plan import (
+    DWELL_TIME,
     CellState,
     MotionPlan,
     Plan,
@@ -215,8 +217,32 @@ def test_misuse_is_one_line(pick: MotionPlan) -> None:
         concatenate_plans([pick, pick])
     with pytest.raises(InputError, match=r"^plan 2: starts with 'nothing' held; expected 'sugar"):
         concatenate_plans([pick, PLANNER.plan_hold(replace(pick.end, held=None), 0.1)])
+    with pytest.raises(InputError, match=r"^place: \[nan, .*; expected a finite position"):
+        PLANNER.plan(SCENE.objects, BOX.name, Pose((math.nan, 0.0, 0.1)))
+    with pytest.raises(InputError, match=r"^place: .*; expected a finite position and a unit"):
+        PLANNER.plan_place(pick.end, Pose((0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 0.0)))
+    with pytest.raises(InputError, match=r"^lift_height: -0\.1; expected a positive number$"):
+        PLANNER.plan_pick(state, BOX.name, lift_height=-0.1)
+    with pytest.raises(InputError, match=r"^duration: 0; expected a positive number$"):
+        PLANNER.plan_hold(state, 0.0)
+    with pytest.raises(InputError, match=r"^goal: .*; expected 6 joint positions in rad$"):
+        PLANNER.plan_move(state, "home")
+    with pytest.raises(InputError, match=r"^plans: none; expected at least one plan$"):
+        concatenate_plans([])
+    with pytest.raises(InputError, match=r"^steps: none; expected at least one step$"):
+        plan_from_steps(state, [])
+    hooked = plan_from_steps(state, [PlanStep("hook", stay_at(HOME), tool="hook")])
+    with pytest.raises(InputError, match=r"^step 'hook': tool 'hook'; expected one of large, sm"):
+        StationSimulation(DEFAULT_CELL, SCENE).execute(hooked)
     with pytest.raises(InputError, match=r"^wait: starts at joints"):
         plan_from_steps(state, [PlanStep("wait", stay_at(np.zeros(6)))])
+
+
+def test_a_move_to_where_the_arm_is_stays_there() -> None:
+    state = PLANNER.home_state(SCENE.objects)
+    plan = planned(PLANNER.plan_move(state, HOME))
+    assert plan.end == state
+    assert plan.duration == pytest.approx(DWELL_TIME)
 
 
 def test_a_move_leads_around_an_obstacle() -> None:

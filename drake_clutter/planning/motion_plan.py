@@ -181,8 +181,10 @@ def plan_from_steps(start: CellState, steps: Sequence[PlanStep]) -> MotionPlan:
         steps: Steps in order, each of which starts where the previous one ends.
 
     Raises:
-        InputError: A step starts elsewhere.
+        InputError: There is no step, or one starts elsewhere.
     """
+    if not steps:
+        raise InputError("steps: none; expected at least one step")
     q = np.array(start.q)
     for step in steps:
         _check_joints(step.name, q, step.trajectory.value(0.0).ravel())

@@ -33,6 +33,8 @@ from drake_clutter.planning.pick_place_search import MoveGoal
 from drake_clutter.planning.state_check import (
     check_held,
     check_joint_limits,
+    check_pose,
+    check_positive,
     find_object,
     to_configuration,
 )
@@ -94,13 +96,15 @@ class PickPlacePlanner(MoveFinder):
             The plan, or the reason why there is none.
 
         Raises:
-            InputError: No object has the name, or a configuration has another number of joints.
+            InputError: No object has the name, the pose is not one, or a configuration has another
+                number of joints.
         """
         start_time = time.perf_counter()
         home = tuple(self.robot.home.tolist())
         state = CellState(home if start is None else tuple(start), tuple(objects))
         q_end = self.robot.home if end is None else to_configuration(self.robot, end, "end")
         picked = find_object(objects, pick)
+        check_pose(X_TO_place, "place")
         # Try the offset first, then the place pose itself; only once if the offset is 0.
         for offset in dict.fromkeys((self.config.descent_start_offset, 0.0)):
             X_TO_start = X_TO_place.translated((0.0, 0.0, offset))
@@ -152,11 +156,13 @@ class PickPlacePlanner(MoveFinder):
             occluded: Occluded volumes, which count as obstacles.
 
         Raises:
-            InputError: No object has the name, or another object is held.
+            InputError: No object has the name, another object is held, or the height is not
+                positive.
         """
         start_time = time.perf_counter()
         check_held(state, is_held=False)
         height = self.config.lift_height if lift_height is None else lift_height
+        check_positive(height, "lift_height")
         goal = MoveGoal(find_object(state.objects, pick), None, height, False, None)
         found = self._find_pick(state, goal, grasp, occluded)
         if isinstance(found, PlanningFailure):
@@ -185,10 +191,11 @@ class PickPlacePlanner(MoveFinder):
             occluded: Occluded volumes, which count as obstacles.
 
         Raises:
-            InputError: No object is held.
+            InputError: No object is held, or the pose is not one.
         """
         start_time = time.perf_counter()
         held = check_held(state, is_held=True)
+        check_pose(X_TO_place, "place")
         picked = find_object(state.objects, held.name)
         goal = MoveGoal(picked, X_TO_place, self.config.lift_height, True, None)
         found = self._find_held(state, goal, occluded)
@@ -268,7 +275,11 @@ class PickPlacePlanner(MoveFinder):
         Args:
             state: State at the start.
             duration: Duration [s].
+
+        Raises:
+            InputError: The duration is not positive.
         """
+        check_positive(duration, "duration")
         step = self._step("hold", stay_at(state.q, duration), state.held)
         return MotionPlan(state, state, (step,))
 

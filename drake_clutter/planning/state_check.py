@@ -11,12 +11,14 @@ from drake_clutter.planning.collision_model import CollisionModel
 from drake_clutter.planning.motion_plan import CellState, HeldObject
 from drake_clutter.planning.pick_place_plan import PlanningFailure, PlanningFailureReason
 from drake_clutter.robots.robot_model import RobotModel
-from drake_clutter.scenes.scene import SceneObject
+from drake_clutter.scenes.scene import Pose, SceneObject
 
 Floats = NDArray[np.float64]
 
 JOINT_TOLERANCE = 1e-6
 """Joint positions may differ by this from what is asked for [rad]."""
+_MAX_QUATERNION_ERROR = 1e-3
+"""Largest difference between the norm of a quaternion and 1: files have rounded numbers."""
 
 
 def find_object(objects: Sequence[SceneObject], name: str) -> SceneObject:
@@ -43,7 +45,10 @@ def to_configuration(robot: RobotModel, q: Sequence[float], name: str) -> Floats
     Raises:
         InputError: There are not n finite numbers.
     """
-    values = np.asarray(q, float)
+    try:
+        values = np.asarray(q, float)
+    except (TypeError, ValueError):
+        values = np.zeros(0)
     if values.shape != (robot.num_joints,) or not np.isfinite(values).all():
         problem = f"{name}: {format_value(list(q))}"
         raise InputError(f"{problem}; expected {robot.num_joints} joint positions in rad")
@@ -106,3 +111,29 @@ def check_held(state: CellState, *, is_held: bool) -> HeldObject:
     if not is_held and state.held is not None:
         raise InputError(f"state: {state.held.name!r} is held; expected no held object")
     return cast(HeldObject, state.held)
+
+
+def check_pose(X_TO: Pose, name: str) -> None:
+    """Check that a pose has finite numbers and a unit quaternion.
+
+    Args:
+        X_TO: The pose.
+        name: Name of the pose.
+
+    Raises:
+        InputError: It does not.
+    """
+    length = float(np.linalg.norm(X_TO.quaternion))
+    if not np.isfinite(X_TO.translation).all() or not abs(length - 1) < _MAX_QUATERNION_ERROR:
+        numbers = format_value([*X_TO.translation, *X_TO.quaternion])
+        raise InputError(f"{name}: {numbers}; expected a finite position and a unit quaternion")
+
+
+def check_positive(value: float, name: str) -> None:
+    """Check that a number is finite and positive.
+
+    Raises:
+        InputError: It is not.
+    """
+    if not 0 < value < np.inf:
+        raise InputError(f"{name}: {value:g}; expected a positive number")

@@ -12,12 +12,14 @@ from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.collision_model import CollisionModel, SignedDistance
 from drake_clutter.planning.motion_limits import LimitViolation, MotionLimits
+from drake_clutter.planning.motion_plan import stay_at
 from drake_clutter.planning.pick_place_plan import (
     FailureLog,
     PlanningFailure,
     PlanningFailureReason,
 )
 from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.planning.state_check import JOINT_TOLERANCE
 from drake_clutter.planning.time_parameterization import (
     MAX_JOINT_STEP,
     bspline_path,
@@ -68,10 +70,14 @@ class TransferPlanner:
     def plan(self, q_start: Floats, goals: Sequence[Floats]) -> Trajectory | PlanningFailure:
         """Return a trajectory to one of several configurations, or why there is none.
 
+        An arm that is there stays at rest for `DWELL_TIME`.
+
         Args:
             q_start: Joint positions at the start. Shape (n,).
             goals: Joint positions, any of which is a goal. Shapes (n,).
         """
+        if any(np.abs(q - q_start).max() < JOINT_TOLERANCE for q in goals):
+            return stay_at(q_start)
         failures = FailureLog()
         reason = PlanningFailureReason.IN_COLLISION
         free = list[Floats]()

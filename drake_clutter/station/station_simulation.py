@@ -316,7 +316,8 @@ class StationSimulation:
             record: Whether to record a sample per step.
 
         Raises:
-            InputError: The plan does not start at the commanded joint positions.
+            InputError: The plan does not start at the commanded joint positions, or a step names
+                an unknown tool.
         """
         self._check_start(plan)
         before = self.scene
@@ -342,7 +343,14 @@ class StationSimulation:
         return self._result(plan, before, max_tracking_error, tuple(motion))
 
     def _check_start(self, plan: Plan) -> None:
-        """Raise an error unless a plan starts at the commanded joint positions."""
+        """Raise an error unless a plan starts at the commanded joints and names known tools."""
+        tools = self.cell.gripper.tools
+        for step in plan.steps:
+            if step.tool and step.tool not in tools:
+                allowed = ", ".join(tools)
+                raise InputError(
+                    f"step {step.name!r}: tool {format_value(step.tool)}; expected one of {allowed}"
+                )
         commanded = self._commanded_positions()
         start = np.array(plan.start.q)
         if start.shape != commanded.shape or np.abs(start - commanded).max() > MAX_START_ERROR:
