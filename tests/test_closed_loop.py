@@ -273,7 +273,12 @@ def test_a_closed_loop_episode_with_another_arm(
     robot: str, joints: int, config: ClutterConfig
 ) -> None:
     cell = load_cell(resource_path(f"models/cells/{robot}_epick_tray.yaml"))
-    loop = ClosedLoop(COVERED, seed=0, config=replace(config, cell=cell), record_motion=True)
+    objects = (
+        resting("gelatin_box", xy=(0.1, 0.0)),
+        resting("cracker_box", xy=(0.1, 0.0), floor=0.028),
+    )
+    scene = Scene(objects, cell.support)  # Each arm reaches its own tray.
+    loop = ClosedLoop(scene, seed=0, config=replace(config, cell=cell), record_motion=True)
     task = run_episode(loop, largest_clear, max_moves=1)
     (step,) = task.transitions
     assert (step.outcome.result, task.termination) == (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import executed, resting, rng, scene_of
 from scipy.spatial.transform import Rotation
-from test_settle_executor import STACKS
+from test_settle_executor import STACKS, put_on
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
@@ -22,7 +22,6 @@ from drake_clutter.scenes.interfaces import (
     MoveResult,
     Observation,
     Outcome,
-    PickPlaceCommand,
 )
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene import TRAY, Pose, Scene, SceneObject
@@ -49,18 +48,6 @@ def execute_move(
 
 def lowest(o: SceneObject) -> float:
     return float(o.bounds_T[0][2])
-
-
-def put_on(scene: Scene, move: Move, x: float = 0.0) -> PickPlaceCommand:
-    """Return a command whether or not its place carries: at x [m] from the middle of what is below.
-
-    Placements are never off balance, but commands of others may be.
-    """
-    picked, below = scene[move.pick], scene[move.place]
-    start = picked.X_TO.p
-    height = below.top_height - lowest(picked) + CONFIG.exploration.release_height
-    shift = [*(below.X_TO.p - start)[:2], height]
-    return PickPlaceCommand(move, picked.X_TO, picked.X_TO.translated(shift).translated([x, 0, 0]))
 
 
 # --- Placed ---
