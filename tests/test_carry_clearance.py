@@ -21,6 +21,7 @@ from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.scenes.scene import Pose, SceneObject
+from drake_clutter.station.station_simulation import StationSimulation
 
 DOWN = RollPitchYaw(np.pi, 0.0, 0.0).ToRotationMatrix()
 GRASP = RigidTransform(DOWN, [0.0, 0.0, 0.0])
@@ -148,6 +149,20 @@ def test_a_carried_box_stays_above_what_it_stood_on(optimize: bool) -> None:
     carry = next(segment for segment in plan.segments if segment.name == "carry")
     assert (carry.duration < carry.unoptimized_duration) == optimize
     assert lowest_above_column(plan, moved, X_TO_end) > 0.010
+
+
+@pytest.mark.parametrize("end", [(0.05, 0.25), (0.25, -0.2)])
+def test_a_hidden_box_is_not_dragged_along(end: tuple[float, float]) -> None:
+    """The box below is simulated, but not known to the planner; a snagged box comes off the cup."""
+    moved, hidden = KNOWN["sugar_box"], resting("cracker_box", xy=(0.05, 0.0))
+    X_TO_end = Pose((*end, moved.X_TO.translation[2] - 0.059), moved.X_TO.quaternion)
+    plan = PickPlacePlanner(DEFAULT_CELL, PlannerConfig()).plan([moved], moved.name, X_TO_end)
+    assert isinstance(plan, PickPlacePlan)
+    result = StationSimulation(DEFAULT_CELL, scene_of(hidden, moved)).execute(plan)
+    assert not result.lost_object
+    assert result.max_load_ratio < 0.5
+    assert result.displacements[hidden.name] < 0.0005
+    assert result.position_error < 0.003
 
 
 def test_the_sag_follows_from_load_and_stiffness() -> None:
