@@ -4,7 +4,7 @@ Frames: T is the support, G is a tool of the gripper, O is the picked object.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -156,11 +156,10 @@ class PickPlaceSearch:
         self._transfer_heights = [bottom + lift_height]
         self._transfer_heights += [top + lift_height for top in tops if top > bottom]
 
-    def ik_candidates(self, grasp: Grasp) -> list[GraspCandidate]:
-        """Return the combinations of yaw and inverse kinematics solutions of a grasp.
+    def ik_candidates(self, grasp: Grasp) -> Iterator[GraspCandidate]:
+        """Yield the combinations of yaw and inverse kinematics solutions of a grasp.
 
-        Returns:
-            Candidates; the one with the shortest travel time first.
+        The one with the shortest travel time is first.
         """
         tool = self._tools[grasp.tool]
         num_yaws = grasp.num_angles or self._config.num_yaws
@@ -182,7 +181,6 @@ class PickPlaceSearch:
         num_candidates = np.isfinite(travel_time).sum()
         num_solutions = travel_time.shape[1]
         indices = [divmod(int(k), num_solutions) for k in order[:num_candidates]]
-        candidates = list[GraspCandidate]()
         for k in indices:
             X_TG_pick, X_TG_place = X_pick[k[0]], X_place[k[0]]
             X_OG = RigidTransform(invert_pose(self._X_TO) @ X_TG_pick)
@@ -191,21 +189,18 @@ class PickPlaceSearch:
                 mass = self._picked.object_class.mass
                 self.failures.record(0, PlanningFailureReason.TOO_HEAVY, "tilted", mass)
                 continue
-            candidates.append(
-                GraspCandidate(
-                    tool=grasp.tool,
-                    payload=payload,
-                    X_TG_pick=X_TG_pick,
-                    X_TG_place=X_TG_place,
-                    X_OG=X_OG,
-                    insertion=grasp.insertion,
-                    joints_open=grasp.joints_open,
-                    joints_held=grasp.joints_held,
-                    q_pick=q_pick[k],
-                    q_place=q_place[k],
-                )
+            yield GraspCandidate(
+                tool=grasp.tool,
+                payload=payload,
+                X_TG_pick=X_TG_pick,
+                X_TG_place=X_TG_place,
+                X_OG=X_OG,
+                insertion=grasp.insertion,
+                joints_open=grasp.joints_open,
+                joints_held=grasp.joints_held,
+                q_pick=q_pick[k],
+                q_place=q_place[k],
             )
-        return candidates
 
     def _solve_endpoints(
         self, tool: ToolKinematics, X_pick: Floats, X_place: Floats

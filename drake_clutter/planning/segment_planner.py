@@ -172,10 +172,18 @@ class SegmentPlanner:
         self._load_distances = {
             name: config.carry_clearance.of_load(cell.gripper.sag(name, mass)) for name in tools
         }
+        self._limits = dict[Payload, MotionLimits]()
+        self._columns_of: tuple[GraspCandidate, tuple[Column, ...]] | None = None
         self._grasp_contacts = {
             name: [(link, picked.name) for link in tool.contact_links]
             for name, tool in cell.gripper.tools.items()
         }
+
+    def _motion_limits(self, payload: Payload) -> MotionLimits:
+        """Return the limits of motions with a load."""
+        if payload not in self._limits:
+            self._limits[payload] = MotionLimits(self._cell, payload)
+        return self._limits[payload]
 
     def load_distance(self, tool: str) -> float:
         """Return the distance that a held object keeps in addition to `min_distance` [m]."""
@@ -357,7 +365,7 @@ class SegmentPlanner:
         min_distance = self._check_segment(name, path, candidate, endpoints, progress)
         if min_distance is None:
             return None
-        trajectory = parameterize_time_optimal(path, MotionLimits(self._cell, payload))
+        trajectory = parameterize_time_optimal(path, self._motion_limits(payload))
         if isinstance(trajectory, LimitViolation):
             self._failures.record(
                 progress,
@@ -453,6 +461,8 @@ class SegmentPlanner:
 
     def _columns(self, candidate: GraspCandidate) -> tuple[Column, ...]:
         """Return the space below the object that something may occupy where it is at rest."""
+        if self._columns_of is not None and self._columns_of[0] is candidate:
+            return self._columns_of[1]
         below_pick, below_place = columns_below(
             self._picked,
             replace(self._picked, X_TO=self._X_TO_place),
@@ -464,7 +474,8 @@ class SegmentPlanner:
             below_pick if self._start is not None else None,
             below_place if self._releases else None,
         )
-        return tuple(column for column in columns if column is not None)
+        self._columns_of = candidate, tuple(column for column in columns if column is not None)
+        return self._columns_of[1]
 
     def _column_clearance(self, candidate: GraspCandidate) -> float:
         """Return the height that a carried object keeps above columns [m]."""
@@ -545,7 +556,7 @@ class SegmentPlanner:
         starts_at_object = segment.name == "retreat" or (is_carry and self._start is not None)
         ends_at_object = segment.name == "approach" or (is_carry and self._releases)
         has_columns = is_carry and (starts_at_object or ends_at_object)
-        limits = MotionLimits(self._cell, payload)
+        limits = self._motion_limits(payload)
         problem = TrajectoryOptimizationProblem(
             initial_trajectory=segment.trajectory,
             robot=self._robot,
