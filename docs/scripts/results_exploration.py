@@ -279,6 +279,51 @@ def _action_filter() -> str:
     return text + table([*head, "collapsed", "moves"], body)
 
 
+def _placement_rule() -> str:
+    rules = {
+        "outermost": "farthest from the center, yaw 0 or 90; on objects the middle of what is "
+        "visible of the top",
+        "packed": "[the rule of this version](../explanation/placement.md)",
+    }
+    rows = {
+        (row["set"], row["agent"], row["fidelity"], row["rule"]): row
+        for row in read_benchmark_results("placement_rule.json")["rows"]
+    }
+    text = section(
+        "Placement rule",
+        "The same policies and scenes with two rules of placements; at most 20 moves. *Room*: "
+        "moves with a free placement, of those that the policy chose. Learned policies choose only "
+        "such moves. *Falls on objects*: collapses in moves onto an object. Intervals are 95 %.",
+        command="python benchmarks/placement_rule.py --rule packed"
+        " --out benchmarks/results/placement_rule.json",
+        seed=2000,
+        results=["benchmarks/results/placement_rule.json"],
+    )
+    text += table(["rule", "placement"], [[f"*{name}*", rule] for name, rule in rules.items()])
+    head = ["dataset", "policy", "moves judged by", "scenes", "rule", "success", "collapsed"]
+    head += ["moves of successes", "room on the tray", "moves onto objects", "falls on objects"]
+    body = []
+    for key in dict.fromkeys(key[:3] for key in rows):
+        for rule in rules:
+            if (row := rows.get((*key, rule))) is not None:
+                body.append(
+                    [
+                        row["set"],
+                        policy_name(row["agent"]),
+                        row["fidelity"],
+                        str(row["episodes"]),
+                        rule,
+                        estimate(row, "success", "success_ci95"),
+                        estimate(row, "collapsed", "collapsed_ci95"),
+                        number(row["moves_of_successes"], 1),
+                        estimate(row, "tray_room", "tray_room_ci95"),
+                        str(row["object_moves"]),
+                        str(row["object_collapses"]),
+                    ]
+                )
+    return text + "\n" + table(head, body)
+
+
 def _trainings() -> str:
     text = section(
         "Trainings",
@@ -335,9 +380,12 @@ def _environment() -> str:
 
 def page() -> str:
     """Return the page."""
-    intro = "# Exploration\n\nExploration policies compared on frozen scene datasets.\n\n" + table(
+    intro = "# Exploration\n\nExploration policies compared on frozen scene datasets. "
+    intro += "Unless stated, placements are those of the rule *outermost*, see "
+    intro += "[placement rule](#placement-rule).\n\n" + table(
         ["name", "`--agent`", "policy"],
         [[name, f"`{agent}`" if agent else "", text] for name, agent, text in _NAMES],
     )
-    parts = [_policies(), _pairs(), _static_and_drake(), _action_filter(), _seeds()]
+    parts = [_policies(), _pairs(), _static_and_drake(), _placement_rule(), _action_filter()]
+    parts.append(_seeds())
     return intro + "\n" + "\n".join([*parts, _trainings(), _environment()])
