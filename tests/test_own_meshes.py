@@ -310,9 +310,12 @@ def test_rays_to_a_bracket_do_not_depend_on_earlier_scenes(
 ) -> None:
     bracket = as_made(own["bracket"], xy, 0.0)
     cover = resting("cereal_box_large", xy=xy, floor=0.2, name="cover")
+    beside = resting("gelatin_box", xy=(xy[0] - 0.03, xy[1]), floor=0.1, name="beside")
+    expected = RayCaster(config.cell.camera).visible_fractions([bracket, beside])
+    assert 0.2 < expected[bracket.name] < 0.8
     caster = RayCaster(config.cell.camera)
     assert caster.visible_fractions([bracket, cover])[bracket.name] < 0.5
-    assert caster.visible_fractions([bracket])[bracket.name] == 1.0
+    assert caster.visible_fractions([bracket, beside]) == expected
 
 
 @pytest.mark.parametrize(
