@@ -16,6 +16,10 @@ PEERS = "planner_peers.json"
 """Results file of `benchmarks/planner_peers.py`."""
 GRASPS = {"JointHold": "weld (locked joint)", "HexapodHold": "compliant (hexapod)"}
 """Grasp constraints by their names in results files of version 0.1."""
+SPEED = "simulation_speed.json"
+"""Results file of the time of simulated moves."""
+CUPS = "cup_sensitivity.json"
+"""Results file of the effect of the numbers of suction cups."""
 OUTCOMES = {"carried out": "executed"}
 """Names of outcomes by those in results files of version 0.1."""
 PARTS = {
@@ -259,6 +263,75 @@ def _peers() -> str:
     return text + table(columns, body)
 
 
+def _speed() -> str:
+    results = read_benchmark_results(SPEED)
+    rows = results["rows"]
+    ratio = rows["before / after"]
+    text = section(
+        "Time of a simulated move",
+        f"{results['count']} random moves in scenes of 25 nodes, simulated in turn by an earlier "
+        "version with rigid bending and by this one, on one core. *Uneventful*: nothing fell, and "
+        "no object is 5 mm from where it should be. Differences of positions are the largest of "
+        "all objects, over moves that are uneventful in both.",
+        command=f"python {results['command']} --baseline DIR --out FILE",
+        seed=results["seed"],
+        results=[f"benchmarks/results/{SPEED}"],
+    )
+    versions = (rows["before"], rows["after"])
+    return text + table(
+        ["", "before", "after", "before / after"],
+        [
+            [
+                "processor time, median / 95th [s]",
+                *(quantiles(row["cpu_s"], 2) for row in versions),
+                quantiles(ratio["cpu"], 2),
+            ],
+            [
+                "wall time, median / 95th [s]",
+                *(quantiles(row["wall_s"], 2) for row in versions),
+                quantiles(ratio["wall"], 2),
+            ],
+            ["processor time of all moves", "", "", number(ratio["total_cpu"])],
+            ["uneventful", *(str(row["uneventful"]) for row in versions), ""],
+            [
+                "difference of final positions, median / 95th [mm]",
+                "",
+                "",
+                quantiles(ratio["position_difference_m"], 2, 1000),
+            ],
+        ],
+    )
+
+
+def _cups() -> str:
+    results = read_benchmark_results(CUPS)
+    text = section(
+        "Effect of the numbers of the suction cups",
+        f"The same {results['count']} random moves, planned and simulated with one number of the "
+        "gripper or of both cups changed by 30 %. *Load*: largest ratio of the load to the load "
+        "capacity at the current vacuum.",
+        command=f"python {results['command']} --out FILE",
+        seed=results["seed"],
+        results=[f"benchmarks/results/{CUPS}"],
+    )
+    head = ["number", "factor", "planned", "executed", "duration, median [s]"]
+    return text + table(
+        [*head, "placement error, median / 95th [mm]", "load, median / 95th"],
+        [
+            [
+                row["number"],
+                number(row["factor"], 1),
+                str(row["planned"]),
+                str(row["carried_out"]),
+                number(row["duration_s"]["p50"]),
+                quantiles(row["place_error_m"], 2, 1000),
+                quantiles(row["load_ratio"], 2),
+            ]
+            for row in results["rows"]
+        ],
+    )
+
+
 def page() -> str:
     """Return the page."""
     intro = (
@@ -269,4 +342,8 @@ def page() -> str:
     sections = [_moves(), _limits(), _parts(), _grasps(), _grippers()]
     if has_benchmark_results(PEERS):
         sections.append(_peers())
+    if has_benchmark_results(SPEED):
+        sections.append(_speed())
+    if has_benchmark_results(CUPS):
+        sections.append(_cups())
     return intro + "\n".join(sections)
