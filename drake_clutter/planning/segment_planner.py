@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +71,8 @@ vertical loads."""
 MAX_TREE_SEARCHES = 3
 """Largest number of searches of a move with RRT-Connect, which takes up to some seconds if it finds
 no path."""
+_TIMING_STAGE = 7
+"""Stage of planning at which paths are timed, after the checks of all paths; see `FailureLog`."""
 _DESCENT_STEP = 0.005
 """Distance between checked points of a guarded descent [m]."""
 
@@ -107,6 +109,14 @@ class GraspCandidate:
     def is_tilted(self) -> bool:
         """Whether the tool does not point down at the grasp or at the place pose."""
         return not (is_vertical(self.X_TG_pick) and is_vertical(self.X_TG_place))
+
+
+@dataclass(frozen=True)
+class _FreePath:
+    """Path that is free of collisions, with its smallest signed distance."""
+
+    path: CubicSpline
+    min_distance: SignedDistance
 
 
 @dataclass(frozen=True)
@@ -315,12 +325,18 @@ class SegmentPlanner:
             q_end = lowering[-1] if self._end is None else self._end
             to_end = self._paths_between(tool, lowering[-1], q_end)
             candidates["retreat"] = ((np.vstack([lowering, path[1:]]) for path in to_end), empty)
+        # All paths are checked for collisions before any is timed, which takes longer.
+        free_paths = dict[str, Iterator[_FreePath]]()
+        for progress, (name, (paths, _)) in enumerate(candidates.items(), start=4):
+            found = self._free_paths(name, paths, candidate, endpoints, progress)
+            first = next(found, None)
+            if first is None:
+                return None
+            free_paths[name] = chain([first], found)
         segments = dict[str, TrajectorySegment]()
-        for progress, (name, (paths, payload)) in enumerate(candidates.items(), start=4):
-            attempts = (
-                self._plan_segment(name, waypoints, payload, candidate, endpoints, progress)
-                for waypoints in paths
-            )
+        for name, (_, payload) in candidates.items():
+            self.set_up_segment(name, candidate)
+            attempts = (self._time_segment(name, path, payload) for path in free_paths[name])
             segment = next((attempt for attempt in attempts if attempt), None)
             if segment is None:
                 return None
@@ -351,31 +367,36 @@ class SegmentPlanner:
         transfer = TransferPlanner(self._cell, self._config, tool, self._collision_model)
         yield from transfer.tree_paths(q, q_end)
 
-    def _plan_segment(
+    def _free_paths(
         self,
         name: str,
-        waypoints: Floats,
-        payload: Payload,
+        paths: Iterable[Floats],
         candidate: GraspCandidate,
         endpoints: tuple[EndpointContext, EndpointContext],
         progress: int,
+    ) -> Iterator[_FreePath]:
+        """Yield those of a segment's paths, given by waypoints, that are free of collisions."""
+        for waypoints in paths:
+            path = bspline_path(waypoints)
+            min_distance = self._check_segment(name, path, candidate, endpoints, progress)
+            if min_distance is not None:
+                yield _FreePath(path, min_distance)
+
+    def _time_segment(
+        self, name: str, free: _FreePath, payload: Payload
     ) -> TrajectorySegment | None:
-        """Return the segment along waypoints, or None after recording a failure."""
-        path = bspline_path(waypoints)
-        min_distance = self._check_segment(name, path, candidate, endpoints, progress)
-        if min_distance is None:
-            return None
-        trajectory = parameterize_time_optimal(path, self._motion_limits(payload))
+        """Return the segment along a path, or None after recording a failure."""
+        trajectory = parameterize_time_optimal(free.path, self._motion_limits(payload))
         if isinstance(trajectory, LimitViolation):
             self._failures.record(
-                progress,
+                _TIMING_STAGE,
                 PlanningFailureReason.TRAJECTORY_INFEASIBLE,
                 f"{name}: {trajectory}",
                 trajectory.ratio,
             )
             return None
         return TrajectorySegment(
-            name, trajectory.to_trajectory(), min_distance, trajectory.end_time
+            name, trajectory.to_trajectory(), free.min_distance, trajectory.end_time
         )
 
     def set_up_segment(self, segment_name: str, candidate: GraspCandidate) -> None:
