@@ -13,7 +13,7 @@ from pydantic import Strict, create_model, model_validator
 
 from drake_clutter.catalog import load_catalog
 from drake_clutter.commands.feasibility_job import FeasibilityJob
-from drake_clutter.feasibility.base_search import BaseGrid, count_reachable_moves, make_base_grids
+from drake_clutter.feasibility.base_search import BaseGrid, find_reachable_moves, make_base_grids
 from drake_clutter.feasibility.home_search import Home
 from drake_clutter.feasibility.inverse_reachability import (
     InverseReachabilityMap,
@@ -168,8 +168,10 @@ class FeasibilityWorker:
         grid: BaseGrid = self._grids()[part.index]
         config = replace(self._job.config, cell=grid.cell)
         moves = find_legal_moves(scene, self._detector, config, self._job.seed, part.scene_index)
-        counts, total = count_reachable_moves(grid, self._maps(part.index), scene, moves)
-        return {"possible": total, "reachable": counts.tolist()}
+        found = find_reachable_moves(grid, self._maps(part.index), scene, moves)
+        possible = [reaches for reaches in found if reaches is not None]
+        counts = np.sum(possible, axis=0, dtype=int) + np.zeros(len(grid.bases), int)
+        return {"possible": len(possible), "reachable": counts.tolist()}
 
     def _analyze_reachability(self, setup: Setup) -> dict[str, Any]:
         analysis = ReachabilityAnalysis(setup.cell)

@@ -104,13 +104,13 @@ def _without_overlaps(grid: BaseGrid) -> BaseGrid:
     return BaseGrid(grid.cell, grid.settings, np.array(kept).reshape(-1, 4))
 
 
-def count_reachable_moves(
+def find_reachable_moves(
     grid: BaseGrid,
     maps: Mapping[str, InverseReachabilityMap],
     scene: Scene,
     moves: Sequence[LegalMove],
-) -> tuple[NDArray[np.int64], int]:
-    """Return how many of the possible moves of a scene each base reaches, by the map.
+) -> list[NDArray[np.bool_] | None]:
+    """Return which bases reach each legal move of a scene, by the map.
 
     Args:
         grid: The bases.
@@ -119,13 +119,12 @@ def count_reachable_moves(
         moves: Its legal moves.
 
     Returns:
-        Number of reached moves of each base, shape (m,), and number of possible moves.
+        Whether each base reaches each move, shape (m,); None for a move that is not possible.
     """
     config = PlannerConfig()
     cell = grid.cell.with_support(scene.support)
     planner = PickPlacePlanner(cell, config)
-    poses: dict[str, list[Floats]] = {name: [] for name in cell.gripper.tools}
-    num_possible = 0
+    found: list[NDArray[np.bool_] | None] = []
     for legal in moves:
         picked = scene[legal.move.pick]
         grasps = planner.grasps(picked)
@@ -134,17 +133,18 @@ def count_reachable_moves(
             or isinstance(grasps, PlanningFailure)
             or objects_resting_on(picked, scene.objects)
         ):
+            found.append(None)
             continue
-        num_possible += 1
-        place = legal.command.X_TO_place
-        for name, rows in poses.items():
+        is_reachable = np.zeros(len(grid.bases), bool)
+        for name, reachability in maps.items():
             of_tool = [grasp for grasp in grasps if grasp.tool == name]
-            rows.append(find_move_poses(picked, place, of_tool, config))
-    is_reachable = np.zeros((len(grid.bases), num_possible), bool)
-    for name, rows in poses.items():
-        joined = MovePoses.join(rows)
-        is_reachable |= maps[name].find_reachable(joined, grid.bases, cell.table_height)
-    return is_reachable.sum(axis=1), num_possible
+            poses = find_move_poses(picked, legal.command.X_TO_place, of_tool, config)
+            reaches = reachability.find_reachable(
+                MovePoses.join([poses]), grid.bases, cell.table_height
+            )
+            is_reachable |= reaches[:, 0]
+        found.append(is_reachable)
+    return found
 
 
 def select_finalists(grids: Sequence[BaseGrid], shares: Sequence[Floats]) -> list[tuple[int, int]]:
