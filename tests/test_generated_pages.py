@@ -109,9 +109,10 @@ def test_exploration_page_has_the_rows_of_tables_two_and_three() -> None:
 
 
 def test_closed_loop_page_words_reasons_as_the_code_does() -> None:
-    row = rows_of(results_closed_loop.page(), "sg_star_25", "depth", "arm", "100")[0]
-    assert row[4:7] == ["0.71 (0.61 to 0.79)", "0.83", "0.86 (0.76 to 0.92)"]
-    assert row[7].startswith("15 collapsed, 13 remaining objects unreachable by suction")
+    row = rows_of(results_closed_loop.page(), "sg_star_25", "depth", "arm", "1", "100")[0]
+    assert row[3] == "1"
+    assert row[5:8] == ["0.71 (0.61 to 0.79)", "0.83", "0.86 (0.76 to 0.92)"]
+    assert row[8].startswith("15 collapsed, 13 remaining objects unreachable by suction")
 
 
 def test_results_files_of_version_0_1_are_read_with_current_keys() -> None:

@@ -213,40 +213,45 @@ def build_inverse_reachability(cell: WorkCell, tool_name: str) -> InverseReachab
 def _find_reachable(branches, lowest, first_height, poses, starts, bases, table):  # type: ignore[no-untyped-def]
     """Return whether each move is reachable from each base, shape (m, k).
 
-    A move is reachable if one branch reaches the grasp, the place and the two points above them,
-    with the links above the table.
+    A move is reachable if one branch reaches the grasp, the place, the two points above them and
+    the one halfway between these, with the links above the table.
     """
     num_radii, num_heights, num_yaws = branches.shape
     found = np.zeros((len(bases), len(starts) - 1), np.bool_)
-    cells = np.empty((4, 3), np.int64)
+    cells = np.empty((5, 3), np.int64)
     for b in range(len(bases)):
         x, y, z = bases[b, 0], bases[b, 1], bases[b, 2]
         for move in range(len(starts) - 1):
             for row in range(starts[move], starts[move + 1]):
+                turn = poses[row, 5] - poses[row, 2]
+                turn -= 2 * np.pi * np.floor(turn / (2 * np.pi) + 0.5)
                 common = 255
-                for end in range(2):
-                    dx = poses[row, 3 * end] - x
-                    dy = poses[row, 3 * end + 1] - y
+                # The grasp and the point above it, halfway, the point above the place, the place.
+                for point in range(5):
+                    s = min(max((point - 1) / 2, 0.0), 1.0)
+                    dx = (1 - s) * poses[row, 0] + s * poses[row, 3] - x
+                    dy = (1 - s) * poses[row, 1] + s * poses[row, 4] - y
                     i = int(np.sqrt(dx * dx + dy * dy) / SPACING + 0.5)
-                    relative = (poses[row, 3 * end + 2] - np.arctan2(dy, dx)) / (2 * np.pi)
+                    relative = (poses[row, 2] + s * turn - np.arctan2(dy, dx)) / (2 * np.pi)
                     k = int(np.floor(relative * num_yaws + 0.5)) % num_yaws
-                    for level in range(2):
-                        height = poses[row, 8] if level else poses[row, 6 + end]
-                        j = int(np.floor((height - z - first_height) / SPACING + 0.5))
-                        if i >= num_radii or j < 0 or j >= num_heights:
-                            common = 0
-                            break
-                        common &= branches[i, j, k]
-                        cells[2 * end + level, 0] = i
-                        cells[2 * end + level, 1] = j
-                        cells[2 * end + level, 2] = k
+                    height = poses[row, 8]
+                    if point == 0:
+                        height = poses[row, 6]
+                    elif point == 4:
+                        height = poses[row, 7]
+                    j = int(np.floor((height - z - first_height) / SPACING + 0.5))
+                    if i >= num_radii or j < 0 or j >= num_heights:
+                        common = 0
+                        break
+                    common &= branches[i, j, k]
                     if common == 0:
                         break
+                    cells[point, 0], cells[point, 1], cells[point, 2] = i, j, k
                 bit = 0
                 while common and not found[b, move]:
                     if common & 1:
                         clear = True
-                        for c in range(4):
+                        for c in range(5):
                             low = lowest[cells[c, 0], cells[c, 1], cells[c, 2], bit]
                             if low + z < table:
                                 clear = False

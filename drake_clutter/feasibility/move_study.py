@@ -69,6 +69,10 @@ class MoveRecord:
         place_x: x of p_TO where the object is released [m]; NaN without a free placement.
         place_y: y of p_TO where the object is released [m]; NaN without a free placement.
         place_z: z of p_TO where the object is released [m]; NaN without a free placement.
+        place_qw: w of the quaternion of R_TO where the object is released; NaN without a place.
+        place_qx: x of it.
+        place_qy: y of it.
+        place_qz: z of it.
         possible: Whether the scene and the tools allow the move, see `IMPOSSIBLE_RESULTS`.
         result: `PLANNED`, or the value of a `PlanningFailureReason`.
         detail: See `PlanningFailure.detail`; without a free placement, the place.
@@ -104,6 +108,10 @@ class MoveRecord:
     place_x: float = math.nan
     place_y: float = math.nan
     place_z: float = math.nan
+    place_qw: float = math.nan
+    place_qx: float = math.nan
+    place_qy: float = math.nan
+    place_qz: float = math.nan
     possible: bool = False
     result: str = PlanningFailureReason.NO_FREE_PLACEMENT.value
     detail: str = ""
@@ -222,6 +230,7 @@ class FeasibilityStudy:
         if command is None:
             return replace(record, detail=move.place)
         place_x, place_y, place_z = (round(v, 6) for v in command.X_TO_place.translation)
+        qw, qx, qy, qz = command.X_TO_place.quaternion
         planner = self.planner(scene, optimize=False)
         plan = planner.plan(scene.objects, move.pick, command.X_TO_place)
         record = replace(
@@ -229,6 +238,10 @@ class FeasibilityStudy:
             place_x=place_x,
             place_y=place_y,
             place_z=place_z,
+            place_qw=qw,
+            place_qx=qx,
+            place_qy=qy,
+            place_qz=qz,
             planning_s=round(plan.planning_time, 4),
         )
         if isinstance(plan, PlanningFailure):

@@ -135,8 +135,7 @@ class NoiseStudy:
         rng = item_rng(self._seed, *path, [*NoiseKind].index(kind))
         believed = add_noise(scene.objects, kind, size, rng)
         picked = next(o for o in believed if o.name == record.pick)
-        place = (record.place_x, record.place_y, record.place_z)
-        X_TO_place = Pose(place, picked.X_TO.quaternion)
+        X_TO_place = _believed_place(scene[record.pick], picked, record)
         plan = planner.plan(believed, record.pick, X_TO_place)
         of_move = self._setup, name, record.pick, record.place, kind.value, size
         if isinstance(plan, PlanningFailure):
@@ -196,6 +195,15 @@ def _displace(o: SceneObject, turn: RotationMatrix, offset: np.ndarray) -> Scene
     X_TO = rigid_transform(o.X_TO)
     X = RigidTransform(turn @ X_TO.rotation(), X_TO.translation() + np.append(offset, 0.0))
     return replace(o, X_TO=pose_from_transform(X))
+
+
+def _believed_place(true: SceneObject, believed: SceneObject, record: MoveRecord) -> Pose:
+    """Return the place pose that turns the believed object as the move turns the true one."""
+    quaternion = (record.place_qw, record.place_qx, record.place_qy, record.place_qz)
+    place = Pose((record.place_x, record.place_y, record.place_z), quaternion)
+    turn = rigid_transform(place).rotation() @ rigid_transform(true.X_TO).rotation().inverse()
+    R = turn @ rigid_transform(believed.X_TO).rotation()
+    return pose_from_transform(RigidTransform(R, place.translation))
 
 
 def scale_mass(simulation: StationSimulation, name: str, factor: float) -> None:

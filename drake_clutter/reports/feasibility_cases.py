@@ -75,7 +75,7 @@ def render_case(
     X_TO = None
     if row["place_x"] is not None:
         p_TO = (row["place_x"], row["place_y"], row["place_z"])
-        X_TO = Pose(p_TO, scene[row["pick"]].X_TO.quaternion)
+        X_TO = Pose(p_TO, tuple(row[f"place_q{axis}"] for axis in "wxyz"))
     images = [renderer.render_annotated(scene, Annotations(moved=row["pick"], X_T_placed=X_TO))]
     if row["result"] != PLANNED:
         detail = ": ".join(filter(None, (row["result"], row["detail"])))
