@@ -309,7 +309,8 @@ def _cups() -> str:
         "Effect of the numbers of the suction cups",
         f"The same {results['count']} random moves, planned and simulated with one number of the "
         "gripper or of both cups changed by 30 %. *Load*: largest ratio of the load to the load "
-        "capacity at the current vacuum.",
+        "capacity at the current vacuum. A vacuum of 1.3 times 80 % is impossible and shows the "
+        "trend only.",
         command=f"python {results['command']} --out FILE",
         seed=results["seed"],
         results=[f"benchmarks/results/{CUPS}"],
