@@ -105,8 +105,9 @@ class PickPlacePlanner(MoveFinder):
         q_end = self.robot.home if end is None else to_configuration(self.robot, end, "end")
         picked = find_object(objects, pick)
         check_pose(X_TO_place, "place")
-        # Try the offset first, then the place pose itself; only once if the offset is 0.
-        for offset in dict.fromkeys((self.config.descent_start_offset, 0.0)):
+        # Try the offset first, then the place pose itself; only once if they are the same.
+        start_offset = self.config.descent_start_offset if self.config.max_guarded_descent else 0.0
+        for offset in dict.fromkeys((start_offset, 0.0)):
             X_TO_start = X_TO_place.translated((0.0, 0.0, offset))
             goal = MoveGoal(picked, X_TO_start, self.config.lift_height, True, q_end)
             found = self._find_pick(state, goal, grasp, occluded)
