@@ -49,8 +49,12 @@ GRIPPER_FIELDS = (
     "lift_vacuum",
 )
 """Numbers of the gripper that are varied."""
-CUP_FIELDS = ("stiffness", "bending_stiffness", "stroke")
-"""Numbers of every cup that are varied."""
+CUP_FIELDS = {
+    "stiffness": "stiffness",
+    "bending_stiffness": "hinge_stiffness",
+    "stroke": "stroke",
+}
+"""Numbers of every cup that are varied, and the names of their present values."""
 FACTORS = (0.7, 1.3)
 """Factors by which a number is changed."""
 SETTINGS = [("default", 1.0), *itertools.product((*GRIPPER_FIELDS, *CUP_FIELDS), FACTORS)]
@@ -84,7 +88,8 @@ def change_cell(name: str, factor: float) -> WorkCell:
         largest = 1.0 if name == "lift_vacuum" else np.inf
         changes = {name: min(factor * getattr(gripper, name), largest)}
     elif name in CUP_FIELDS:
-        cups = [c.model_copy(update={name: factor * getattr(c, name)}) for c in gripper.cups]
+        present = CUP_FIELDS[name]
+        cups = [c.model_copy(update={name: factor * getattr(c, present)}) for c in gripper.cups]
         changes = {"cups": tuple(cups)}
     return cell.model_copy(update={"gripper": gripper.model_copy(update=changes)})
 

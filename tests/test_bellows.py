@@ -84,14 +84,14 @@ def test_a_load_deflects_and_tilts_the_bellows(offset: float, time_step: float) 
 
     def moment(tilt: float) -> float:
         lever = offset * math.cos(tilt) - (CUP.hinge_distance + DEPTH) * math.sin(tilt)
-        return float(weight * lever - CUP.bending_stiffness * tilt)
+        return float(weight * lever - CUP.hinge_stiffness * tilt)
 
     tilt = float(brentq(moment, -0.5, 0.5))
     extension, about_x, about_y = bellows(station, root)
     assert extension == pytest.approx((weight + GRAVITY * CUP.mass) / CUP.stiffness, rel=0.005)
     assert about_x == pytest.approx(tilt, rel=0.02, abs=1e-4)
     assert about_y == pytest.approx(0.0, abs=1e-4)
-    assert tilt == pytest.approx(offset * weight / CUP.bending_stiffness, rel=0.05)
+    assert tilt == pytest.approx(offset * weight / CUP.hinge_stiffness, rel=0.05)
 
 
 def test_the_load_on_the_lip_is_that_of_the_tilted_object() -> None:
@@ -124,7 +124,7 @@ def test_a_load_swings_with_its_natural_frequency_and_comes_to_rest() -> None:
     about_x = float((R_GO @ inertia_O.CalcRotationalInertia().CopyToFullMatrix3() @ R_GO.T)[0, 0])
     depth = CUP.hinge_distance + DEPTH
     inertia = about_x + box.object_class.mass * (depth**2 + 0.02**2)
-    stiffness = CUP.bending_stiffness + GRAVITY * box.object_class.mass * depth
+    stiffness = CUP.hinge_stiffness + GRAVITY * box.object_class.mass * depth
     frequency = math.sqrt(stiffness / inertia)
     ratio = CUP.bending_damping / (2 * math.sqrt(stiffness * inertia))
     peak = math.pi / (frequency * math.sqrt(1 - ratio**2))

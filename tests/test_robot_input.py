@@ -15,7 +15,7 @@ from drake_clutter.simulation.cell_plant import validate_models
 JOINTS = ", ".join(robot("ur5e").joint_names)
 SHIPPED = "package://drake_clutter_models/FILE"
 ORDER = "the lower, then the upper limit"
-PLACES = "a value for each joint, here or in the model file"
+PLACES = "a value for each joint, here or in"
 
 
 def changed(spec: RobotSpec, **fields: Any) -> RobotSpec:
@@ -94,7 +94,7 @@ def test_a_joint_without_a_limit_is_refused(tmp_path: Path, taken_out: str, kind
         text = text.replace('elbow_joint" type="revolute"', 'elbow_joint" type="continuous"')
     spec = ros_spec(tmp_path, text)
     assert message(spec) == (
-        f"robot.limits.{kind}: is missing for joint 'elbow_joint'; expected {PLACES}"
+        f"robot.limits.{kind}: is missing for joint 'elbow_joint'; expected {PLACES} {spec.model}"
     )
     given: Any = ((-3.0, 3.0),) * 6 if kind == "position" else (2.0,) * 6
     arm = load_robot(changed(spec, **{f"limits_{kind}": given}))

@@ -118,7 +118,7 @@ def _moving_cup(cup: SuctionCup) -> tuple[list[str], list[str]]:
     ]
     about_x, about_y = cup.bending_joints
     limit = f"<lower>{-cup.stroke:g}</lower><upper>{cup.stroke:g}</upper>"
-    bending = (cup.bending_stiffness, cup.bending_damping)
+    bending = (cup.hinge_stiffness, cup.bending_damping)
     hinge = f"<pose>0 0 {-cup.hinge_distance:.12g} 0 0 0</pose>"
     return links, [
         _joint(

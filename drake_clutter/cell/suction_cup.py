@@ -27,6 +27,11 @@ _DAMPING_RATIO = 2.0
 _BENDING_DAMPING_RATIO = 0.3
 """Damping ratio of the bending bellows with the reference load at `_REFERENCE_DISTANCE`: rubber and
 the friction between folds; an assumption."""
+_RUBBER_MODULUS = 3.6e6
+"""Modulus of elasticity of the rubber [Pa]: NBR of 60 Shore A by the relation of Gent (1958), from
+memory."""
+_BORE_FRACTION = 1 / 3
+"""Bore of the folded bellows as a fraction of the lip's diameter; assumed."""
 _REFERENCE_DISTANCE = 0.1
 """Distance of the reference load from the bellows [m]."""
 _NUM_MOVING_LINKS = 3
@@ -48,7 +53,8 @@ class SuctionCup(StrictModel):
         tube_radius: Radius of the tube [m].
         stroke: Largest compression, and largest extension, of the bellows [m].
         stiffness: Axial stiffness of the bellows [N/m].
-        bending_stiffness: Stiffness of the evacuated bellows against tilt of the lip [N m/rad].
+        bending_stiffness: Stiffness of the evacuated bellows against tilt of the lip [N m/rad]; None
+            for that of a beam of solid rubber, see `hinge_stiffness`.
     """
 
     name: Annotated[str, Field(strict=True, pattern=r"^[A-Za-z]\w*$")]
@@ -59,7 +65,7 @@ class SuctionCup(StrictModel):
     tube_radius: Annotated[float, InRange(0.001, 0.05)] = 0.010
     stroke: Annotated[float, InRange(0.001, 0.05)] = 0.006
     stiffness: Annotated[float, InRange(100.0, 1e5)] = 2_000.0
-    bending_stiffness: Annotated[float, InRange(1e-3, 1e3)] = 4.9
+    bending_stiffness: Annotated[float, InRange(1e-3, 1e3)] | None = None
 
     @property
     def link(self) -> str:
@@ -108,10 +114,23 @@ class SuctionCup(StrictModel):
         return _DAMPING_RATIO * 2 * math.sqrt(self.stiffness * reference_load)
 
     @property
+    def hinge_stiffness(self) -> float:
+        """Stiffness against tilt of the lip [N m/rad].
+
+        By default it is E I / h of a hollow cylinder: the vacuum folds the bellows to solid rubber
+        of the height h, their length without the stroke.
+        """
+        if self.bending_stiffness is not None:
+            return self.bending_stiffness
+        bore = _BORE_FRACTION * self.diameter
+        second_moment = math.pi / 64 * (self.diameter**4 - bore**4)
+        return _RUBBER_MODULUS * second_moment / max(self.length - self.stroke, self.stroke)
+
+    @property
     def bending_damping(self) -> float:
         """Damping of the bending bellows [N m s/rad]."""
         inertia = _REFERENCE_LOAD * self._relative_area * _REFERENCE_DISTANCE**2
-        return 2 * _BENDING_DAMPING_RATIO * math.sqrt(self.bending_stiffness * inertia)
+        return 2 * _BENDING_DAMPING_RATIO * math.sqrt(self.hinge_stiffness * inertia)
 
     @property
     def _relative_area(self) -> float:
