@@ -53,8 +53,8 @@ class SuctionCup(StrictModel):
         tube_radius: Radius of the tube [m].
         stroke: Largest compression, and largest extension, of the bellows [m].
         stiffness: Axial stiffness of the bellows [N/m].
-        bending_stiffness: Stiffness of the evacuated bellows against tilt of the lip [N m/rad]; None
-            for that of a beam of solid rubber, see `hinge_stiffness`.
+        bending_stiffness: Stiffness of the evacuated bellows against tilt of the lip [N m/rad].
+            None: that of a beam of solid rubber, see `hinge_stiffness`.
     """
 
     name: Annotated[str, Field(strict=True, pattern=r"^[A-Za-z]\w*$")]
