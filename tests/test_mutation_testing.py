@@ -8,6 +8,9 @@ import time
 from importlib.util import module_from_spec
 from pathlib import Path
 
+import pytest
+
+from benchmarks import mutation_testing
 from benchmarks.mutation_operators import find_mutants, rank
 from benchmarks.mutation_testing import TestCoverage, git_blobs, is_current, mutant_row
 from benchmarks.mutation_worker import (
@@ -198,6 +201,12 @@ def test_coverage_is_outdated_when_a_measured_file_changes(tmp_path: Path) -> No
     ):
         path.write_text(json.dumps({"blobs": blobs}))
         assert is_current(path) == expected
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_the_listed_test_files_exist(compiled: bool) -> None:
+    paths = mutation_testing.test_files(compiled=compiled)
+    assert [path for path in paths if not (ROOT / path).exists()] == []
 
 
 def test_results_outside_the_sample_are_removed(tmp_path: Path) -> None:

@@ -30,8 +30,7 @@ def _score(name: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
 def _scores(rows: Sequence[Mapping[str, Any]], sample: int, seed: int) -> str:
     text = section(
         "Scores",
-        f"{len(rows)} mutants of the modules that decide results, from uniform samples of "
-        f"{sample}; the sample changes with the code, and planning and the station come last. "
+        f"{len(rows)} of a uniform sample of {sample} mutants of the modules that decide results. "
         "*Caught*: a test fails, the process ends, or the time limit is exceeded. *Equivalent*: "
         "the mutant gives the same results as the original. The results file names the content "
         "of the module, as a Git blob, at which each mutant was tested.",
