@@ -43,10 +43,23 @@ SHAPES = {
 }
 
 
-class Pair:
-    """A shape on a prismatic joint along x, and a fixed shape, here and in Drake."""
+# The z axis of the joint is the x axis of T.
+X_TJ_ALONG_X = np.array(
+    [[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
 
-    def __init__(self, moving: Shape, fixed: Shape) -> None:
+
+class Pair:
+    """A shape on a joint, by default prismatic along x, and a fixed shape, here and in Drake."""
+
+    def __init__(
+        self,
+        moving: Shape,
+        fixed: Shape,
+        X_TJ: Floats = X_TJ_ALONG_X,
+        *,
+        revolute: bool = False,
+    ) -> None:
         self._scene_graph = SceneGraph()
         self._source = self._scene_graph.RegisterSource("pair")
         self._frames, geometries = [], []
@@ -57,24 +70,29 @@ class Pair:
             geometries.append(self._scene_graph.RegisterGeometry(self._source, frame, instance))
             self._frames.append(frame)
         self.geometries = geometries
-        along_x = np.array(
-            [[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-        )
-        self._chain = SerialChain(np.array([along_x, np.eye(4)]), np.array([False]))
+        self._chain = SerialChain(np.array([X_TJ, np.eye(4)]), np.array([revolute]))
 
-    def distance(
-        self, X_moving: RigidTransform, X_fixed: RigidTransform, threshold: float = 10.0
-    ) -> tuple[float, float]:
-        """Return the compiled distance and its derivative along x; NaN if cores intersect."""
-        table = ShapeTable(
+    def table(self, X_moving: RigidTransform, X_fixed: RigidTransform) -> ShapeTable:
+        """Return the table of both shapes at their poses; that of the moving one at q = 0."""
+        return ShapeTable(
             self._scene_graph.model_inspector(),
             {self.geometries[0]: 1, self.geometries[1]: 0},
             [X_moving.GetAsMatrix4(), X_fixed.GetAsMatrix4()],
             self._chain,
             np.eye(4),
         )
-        pairs = np.array([[0, 1]])
-        found = table.find_distances(np.zeros((1, 1)), pairs, threshold, with_gradients=True)
+
+    def distance(
+        self,
+        X_moving: RigidTransform,
+        X_fixed: RigidTransform,
+        threshold: float = 10.0,
+        q: float = 0.0,
+    ) -> tuple[float, float]:
+        """Return the compiled distance and its derivative by q; NaN if cores intersect."""
+        pairs, path = np.array([[0, 1]]), np.array([[q]])
+        table = self.table(X_moving, X_fixed)
+        found = table.find_distances(path, pairs, threshold, with_gradients=True)
         if not len(found.distances):
             return math.inf, 0.0
         return float(found.distances[0]), float(found.gradients[0, 0])
@@ -116,12 +134,39 @@ def test_distances_are_those_of_drake(first: str, second: str) -> None:
         assert distance <= drake + 1e-6
         assert distance >= drake - (1e-3 if is_curved else 1e-4)
         assert pair.distance(X_A, X_B, threshold=distance - 1e-6)[0] == math.inf
-        ahead, behind = (
-            pair.distance(RigidTransform([sign * STEP, 0.0, 0.0]) @ X_A, X_B)[0] for sign in (1, -1)
-        )
+        assert pair.distance(X_A, X_B, threshold=distance + 1e-6)[0] == distance
+        ahead, behind = (pair.distance(X_A, X_B, q=sign * STEP)[0] for sign in (1, -1))
+        shifted = pair.distance(RigidTransform([STEP, 0.0, 0.0]) @ X_A, X_B)[0]
+        assert ahead == pytest.approx(shifted, abs=1e-9)
         if max(ahead, behind) - distance < 0.3 * STEP or abs(ahead + behind - 2 * distance) < 1e-8:
             assert gradient == pytest.approx((ahead - behind) / (2 * STEP), abs=0.02)
     assert num_compared > 20
+
+
+@pytest.mark.parametrize(("first", "second"), [("box", "capsule"), ("convex", "sphere")])
+def test_derivatives_by_the_angle_of_a_joint(first: str, second: str) -> None:
+    generator = rng(8)
+    for _ in range(10):
+        X_TJ, X_A, X_B = (random_pose(generator, 0.4) for _ in range(3))
+        pair = Pair(SHAPES[first], SHAPES[second], X_TJ.GetAsMatrix4(), revolute=True)
+        distance, gradient = pair.distance(X_A, X_B)
+        if math.isnan(distance):
+            continue
+        ahead, behind = (pair.distance(X_A, X_B, q=sign * STEP)[0] for sign in (1, -1))
+        assert gradient == pytest.approx((ahead - behind) / (2 * STEP), abs=2e-3)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_the_lowest_point_of_a_moving_shape(name: str) -> None:
+    """It is the distance to a wide box below, whose top is at z = -2 m."""
+    generator = rng(9)
+    X_TJ = random_pose(generator, 0.4)
+    pair = Pair(SHAPES[name], Box(20.0, 20.0, 2.0), X_TJ.GetAsMatrix4(), revolute=True)
+    below = RigidTransform([0.0, 0.0, -3.0])
+    for q in (0.0, 0.7, -2.0):
+        X_A = random_pose(generator, 0.4)
+        (lowest,) = pair.table(X_A, below).lowest_points(np.array([[q]]), [0])
+        assert lowest + 2.0 == pytest.approx(pair.distance(X_A, below, q=q)[0], abs=1e-5)
 
 
 def test_distances_of_capsules_equal_those_of_their_segments() -> None:

@@ -4,12 +4,20 @@ import math
 
 import numpy as np
 import pytest
-from conftest import resting, rng
+from conftest import cell_with, resting, rng
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+from pydrake.multibody.tree import MultibodyForces
 
 from benchmarks.motion_limits import ROBOTS, cell_of, limit_ratios
+from drake_clutter.cell.gripper import Payload
+from drake_clutter.planning.arm_dynamics import dynamics_plant
+from drake_clutter.planning.cubic_spline import MotionSamples
+from drake_clutter.planning.motion_limits import LimitKind, MotionLimits
 from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.scene import Pose
 
 NUM_MOVES = 5
@@ -48,3 +56,72 @@ def test_a_torque_below_that_of_gravity_is_a_planning_failure() -> None:
     assert isinstance(failure, PlanningFailure)
     assert str(failure) == "trajectory infeasible: carry: torque of shoulder_lift_joint"
     assert failure.value == math.inf
+
+
+def test_ratios_of_a_motion_to_its_limits() -> None:
+    """Compare with the dynamics of Drake, and with numerical derivatives of the poses of the tool.
+
+    The speed of the tool is limited by the smaller one of two limits.
+    """
+    cell = cell_with("robot.tool_speed=0.5")
+    robot, payload = load_robot(cell.robot), Payload(2.0, (0.02, 0.01, 0.2), 7.0)
+    limits = MotionLimits(cell, payload, max_tool_speed=0.8)
+    generator = rng(3)
+    home = np.array(cell.robot.home)
+    q, v, a, jerk = (
+        home + generator.uniform(-0.5, 0.5, (4, 6)),
+        *(scale * generator.normal(size=(4, 6)) for scale in (0.1, 0.2, 5.0)),
+    )
+    ratios = limits.ratios(MotionSamples(q, v, a, jerk))
+    plant = dynamics_plant(cell, payload)
+    context = plant.CreateDefaultContext()
+    gravity, torque = np.empty((2, 4, 6))
+    for k in range(4):
+        plant.SetPositions(context, q[k])
+        gravity[k] = -plant.CalcGravityGeneralizedForces(context)
+        plant.SetVelocities(context, v[k])
+        torque[k] = plant.CalcInverseDynamics(context, a[k], MultibodyForces(plant))
+        torque[k] += gravity[k]
+    dynamic = torque - gravity
+    lower, upper = robot.position_limits.T
+    positions = np.abs((q - (lower + upper) / 2) / ((upper - lower) / 2))
+    reserve = np.where(dynamic > 0, robot.torque_limits - gravity, robot.torque_limits + gravity)
+
+    def points(time: float, tool: str | None) -> NDArray[np.float64]:
+        """Return the positions of a tool, or of the load's center of mass."""
+        p_FC = payload.p_FCm if tool is None else cell.gripper.tools[tool].X_FG.translation()
+        at = q + time * v + time**2 / 2 * a
+        return np.array([RigidTransform(robot.forward_kinematics(x)) @ p_FC for x in at])
+
+    step = 1e-3
+    load = np.array([points(time, None) for time in (-step, 0.0, step)])
+    load_acceleration = (load[0] - 2 * load[1] + load[2]) / step**2
+    speeds = [
+        np.linalg.norm(points(step, tool) - points(-step, tool), axis=1) / (2 * step)
+        for tool in cell.gripper.tools
+    ]
+    expected = {
+        LimitKind.POSITION: positions,
+        LimitKind.VELOCITY: np.abs(v) / robot.velocity_limits,
+        LimitKind.ACCELERATION: np.abs(a) / robot.acceleration_limits,
+        LimitKind.JERK: np.abs(jerk) / robot.jerk_limits,
+        LimitKind.TORQUE: np.abs(dynamic) / reserve,
+        LimitKind.LOAD: np.linalg.norm(load_acceleration, axis=1)[:, None] / 7.0,
+        LimitKind.TOOL_SPEED: np.transpose(speeds) / 0.5,
+    }
+    for kind, values in expected.items():
+        assert ratios.values[:, ratios.kinds == kind] == pytest.approx(values, rel=2e-4), kind
+    slowed = {
+        1: (LimitKind.VELOCITY, LimitKind.TOOL_SPEED),
+        2: (LimitKind.ACCELERATION, LimitKind.TORQUE, LimitKind.LOAD),
+        3: (LimitKind.JERK,),
+    }
+    scales = np.max(
+        [
+            np.hstack([expected[kind] for kind in kinds]).max(axis=1) ** (1 / order)
+            for order, kinds in slowed.items()
+        ],
+        axis=0,
+    )
+    assert ratios.time_scales() == pytest.approx(scales, rel=2e-4)
+    assert scales.max() < 1.0, "the motion may be faster"

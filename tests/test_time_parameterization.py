@@ -5,8 +5,10 @@ import math
 import numpy as np
 import pytest
 from conftest import DEFAULT_CELL, cell_with, rng
+from numpy.typing import NDArray
 from pydrake.multibody.optimization import Toppra
 from pydrake.trajectories import BsplineTrajectory, Trajectory
+from scipy.optimize import linprog
 
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import WorkCell
@@ -26,6 +28,7 @@ from drake_clutter.planning.time_parameterization import (
     path_speed_problem,
     sample_path,
 )
+from drake_clutter.planning.toppra import solve_toppra
 from drake_clutter.robots.robot_model import load_robot
 
 ARM = DEFAULT_CELL
@@ -196,6 +199,39 @@ def test_time_optimal_durations_equal_those_of_drakes_toppra() -> None:
         speeds = problem.time_optimal_speeds()
         duration = (2 * np.diff(problem.grid) / (speeds[1:] + speeds[:-1])).sum()
         assert duration == pytest.approx(toppra.SolvePathParameterization().end_time(), rel=0.01)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_path_speeds_are_the_largest_that_satisfy_limits_at_both_ends_of_each_step(
+    seed: int,
+) -> None:
+    """Compare with linear programming: the largest sum of squared speeds x from rest to rest.
+
+    The acceleration of a step is that of x. The first limit is one of x alone.
+    """
+    generator = rng(seed)
+    count, step = 12, 0.1
+    a = generator.uniform(0.2, 1.0, (count, 3)) * generator.choice([-1.0, 1.0], (count, 3))
+    a[:, 0] = 0.0
+    b = generator.uniform(-1.0, 1.0, (count, 3))
+    lower, upper = -generator.uniform(0.5, 1.5, (count, 3)), generator.uniform(0.5, 1.5, (count, 3))
+    largest = generator.uniform(0.5, 2.0, count)
+    x = solve_toppra(step, a, b, lower, upper, largest)
+    rows, bounds = list[NDArray[np.float64]](), list[float]()
+    for i in range(count - 1):
+        for point in (i, i + 1):
+            for k in range(3):
+                row = np.zeros(count)
+                row[i] -= a[point, k] / (2 * step)
+                row[i + 1] += a[point, k] / (2 * step)
+                row[point] += b[point, k]
+                rows += [row, -row]
+                bounds += [upper[point, k], -lower[point, k]]
+    assert (np.array(rows) @ x <= np.array(bounds) + 1e-9).all()
+    limits = [(0.0, float(value)) for value in largest]
+    limits[0] = limits[-1] = (0.0, 0.0)
+    optimum = linprog(-np.ones(count), np.array(rows), bounds, bounds=limits)
+    assert x == pytest.approx(optimum.x, abs=1e-6)
 
 
 def test_a_joint_moves_nearly_as_fast_as_its_limits_allow() -> None:
