@@ -7,6 +7,7 @@ at random times, and adds commands that take longer:
     KILLS=20 python -m pytest tests/test_kills.py
 """
 
+import csv
 import errno
 import json
 import os
@@ -75,7 +76,8 @@ MAX_FILE_SIZE = 1000
 """Largest file that a process can write which stands for one with a full disk [bytes]."""
 WALL_TIMES = re.compile(
     r'(?P<key>(?P<quote>"|&quot;)(?:seconds|wall|planning|planning_time|planning_s|p50|p95|p99)'
-    r"(?P=quote): )[-+.e\d]+"
+    r"(?P=quote): (?:\{\s*(?P=quote)median(?P=quote): )?)[-+.e\d]+"
+    r"|(?<=<td>)[.\d]+(?= s</td>)"
 )
 """Values in a text that differ between two runs."""
 Tree = dict[str, bytes | str]
@@ -145,7 +147,11 @@ def read_tree(out: Path) -> Tree:
     for path in sorted(out.rglob("*")):
         if "tensorboard" in path.parts:
             continue  # Its files have the time in their names.
-        if path.is_file() and path.suffix in (".json", ".html", ".csv"):
+        if path.is_file() and path.suffix == ".csv":
+            with path.open() as file:
+                rows = [row | {"planning_s": ""} for row in csv.DictReader(file)]
+            tree[str(path.relative_to(out))] = json.dumps(rows)
+        elif path.is_file() and path.suffix in (".json", ".html"):
             text = path.read_text().replace(str(out), "OUT")
             tree[str(path.relative_to(out))] = WALL_TIMES.sub(r"\g<key>", text)
         elif path.is_file():

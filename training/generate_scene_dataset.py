@@ -57,9 +57,15 @@ VERDICTS_FILE = "judged.jsonl"
 """Record file of a training set's verdicts, in the folder `--work`."""
 
 
-def read_stable_scenes(folder: Path, catalog: Catalog) -> Iterator[SceneRecord]:
-    """Yield the stable scenes with hidden objects of a folder that `generate` wrote."""
-    solvable = read_generation_progress(folder / PROGRESS_FILE).solvable
+def read_stable_scenes(folder: Path, catalog: Catalog, count: int) -> Iterator[SceneRecord]:
+    """Yield the stable scenes with hidden objects of a folder that `generate` wrote.
+
+    Args:
+        folder: The folder.
+        catalog: Object classes.
+        count: Number of scenes that are read; the folder may hold more, if a run was interrupted.
+    """
+    solvable = read_generation_progress(folder / PROGRESS_FILE).solvable[:count]
     for index, answer in enumerate(solvable):
         file = load_scene(folder / SCENES_FOLDER / f"{index:04d}.yaml", catalog)
         assert file.verdict is not None
@@ -219,9 +225,8 @@ def main(
                 workers,
                 lambda items, done, total: progress(items, out.stem, total, done),
             )
-            scenes = list(
-                drop_duplicates(read_stable_scenes(work, load_catalog(catalog)), excluded_forms)
-            )
+            stable = read_stable_scenes(work, load_catalog(catalog), num_generated)
+            scenes = list(drop_duplicates(stable, excluded_forms))
     else:
         judge = partial(GraphJudge, job)
         records = resume_jsonl(
