@@ -194,7 +194,7 @@ def test_an_object_balances_while_its_center_of_mass_is_above_the_contact(axis: 
     lower, upper = BOX, resting("cracker_box", name="upper")
     shapes = ShapeTable()
     rows, _ = shapes.rows_and_positions([lower, upper])
-    table = np.concatenate([shapes.arrays.table, shapes.arrays.table[rows[1:]]])
+    table = np.concatenate([shapes.arrays.table, shapes.arrays.table[rows[1:]]]).view(np.recarray)
     lone = len(table) - 1
     table["first_part"][lone], table["last_part"][lone] = lone, lone + 1
     table["com"][lone, axis] = 0.03

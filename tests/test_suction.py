@@ -268,6 +268,10 @@ def test_grasps_are_sorted_from_the_center_of_the_top() -> None:
     ]
     assert (np.diff(distances) > -1e-9).all()
     assert found[0].payload.mass == box.object_class.mass
+    # The load hangs below the lip on the axis of the cup, by whole centimeters.
+    below = round(box.top_height / 2 + SAMPLING.lip_gap, 2)
+    load = gripper.tools[found[0].tool].X_FG @ np.array([0.0, 0.0, below])
+    assert found[0].payload.p_FCm == pytest.approx(load)
     assert found[0].payload.max_acceleration >= found[-1].payload.max_acceleration >= 0.3
 
 
