@@ -119,6 +119,20 @@ def test_an_object_is_dropped_if_the_vacuum_is_too_weak(plan: PickPlacePlan) -> 
     assert result.position_error > 0.2
 
 
+def test_an_uneventful_move_changes_nothing_but_the_picked_object(plan: PickPlacePlan) -> None:
+    result = run(plan)
+    assert result.is_uneventful
+    assert replace(result, displacements={}).is_uneventful
+    for change in (
+        {"grasped": False},
+        {"drop_time": 1.0},
+        {"position_error": 0.1},
+        {"orientation_error": 1.0},
+        {"displacements": {"a": 0.0, "b": 0.1}},
+    ):
+        assert not replace(result, **change).is_uneventful
+
+
 def test_an_object_is_not_lifted_without_a_seal(plan: PickPlacePlan) -> None:
     result = run(plan, cell_with("gripper.unevenness=0"))
     assert not result.grasped
