@@ -18,11 +18,13 @@ from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.planning.collision_model import SignedDistance
 from drake_clutter.planning.motion_plan import DWELL_TIME
 from drake_clutter.planning.pick_place_plan import (
     PickPlacePlan,
     PlanningFailure,
     PlanningFailureReason,
+    plan_to_dict,
 )
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
@@ -188,6 +190,21 @@ def test_later_moves_are_not_blamed_for_an_object_beside_the_tray(config: Clutte
     after = before.with_poses({"sugar_box": PLACE, "pudding_box": LOST.translated((0.1, 0, 0))})
     outcome = evaluate_outcome(before, after, "sugar_box", PLACE, False, config.settle)
     assert (outcome.result, outcome.instability) == (MoveResult.PLACED, None)
+
+
+def test_a_written_plan_has_the_smallest_distance_of_each_segment(plan: PickPlacePlan) -> None:
+    near = SignedDistance(0.01, ("sugar_box", "floor"))
+    alone = SignedDistance(math.inf, ("", ""))
+    first, *others = plan.segments
+    segments = (
+        replace(first, min_distance=near),
+        *(replace(o, min_distance=alone) for o in others),
+    )
+    written = plan_to_dict(replace(plan, segments=segments))["segments"]
+    assert [(s["min_distance"], s["closest_pair"]) for s in written] == [
+        (0.01, ["sugar_box", "floor"]),
+        *[(None, [])] * len(others),
+    ]
 
 
 def test_stages_of_the_command_schedule(plan: PickPlacePlan) -> None:

@@ -234,8 +234,9 @@ def test_misuse_is_one_line(pick: MotionPlan) -> None:
     hooked = plan_from_steps(state, [PlanStep("hook", stay_at(HOME), tool="hook")])
     with pytest.raises(InputError, match=r"^step 'hook': tool 'hook'; expected one of large, sm"):
         StationSimulation(DEFAULT_CELL, SCENE).execute(hooked)
-    with pytest.raises(InputError, match=r"^wait: starts at joints"):
-        plan_from_steps(state, [PlanStep("wait", stay_at(np.zeros(6)))])
+    for start in (np.zeros(6), np.array([*HOME[:5], HOME[5] + 0.01])):
+        with pytest.raises(InputError, match=r"^wait: starts at joints"):
+            plan_from_steps(state, [PlanStep("wait", stay_at(start))])
 
 
 def test_a_move_to_where_the_arm_is_stays_there() -> None:

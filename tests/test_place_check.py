@@ -15,7 +15,7 @@ from drake_clutter.planning.pick_place_plan import (
     PlanningFailureReason,
 )
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
-from drake_clutter.planning.place_check import check_place, resting_tilt
+from drake_clutter.planning.place_check import _overhang, check_place, resting_tilt
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.resources import resource_path
 from drake_clutter.robots.robot_model import load_robot
@@ -225,3 +225,20 @@ def test_an_unknown_object_and_a_home_beyond_the_limits_are_one_line() -> None:
     cell = cell_with("robot.home=[7, -1.5, 1, -1.5, -1.5, 0]")
     with pytest.raises(InputError, match=r"robot.home: 7 for joint .*; expected from -6.28"):
         load_robot(cell.robot)
+
+
+def test_the_overhang_beyond_a_line_and_beyond_a_polygon() -> None:
+    """The line leads from (0.1, 0) to (0.1, 0.4)."""
+    line = np.array([[0.1, 0.0], [0.1, 0.1], [0.1, 0.4]])
+    for x, y, expected in (
+        (0.1, 0.2, 0.0),
+        (0.13, 0.2, 0.03),
+        (0.06, 0.35, 0.04),
+        (0.13, 0.44, 0.05),
+        (0.1, -0.02, 0.02),
+    ):
+        for points in (line, line[[0, 2]]):
+            assert _overhang(points, np.array([x, y])) == pytest.approx(expected, abs=1e-9)
+    square = np.array([[0.0, 0.0], [0.2, 0.0], [0.2, 0.2], [0.0, 0.2]])
+    assert _overhang(square, np.array([0.1, 0.15])) == 0.0
+    assert _overhang(square, np.array([0.1, 0.25])) == pytest.approx(0.05)
