@@ -11,9 +11,11 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
 from drake_clutter.cell.gripper import Payload
-from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.cell.payload_limits import GRAVITY
+from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.grammar import Orientation
 from drake_clutter.planning.arm_dynamics import arm_dynamics
+from drake_clutter.resources import resource_path
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.grasp_constraint import WeldPair
@@ -92,3 +94,31 @@ def test_an_object_that_the_arm_touches_is_in_contact() -> None:
     simulator.AdvanceTo(TIME_STEP)
     # The other box touches the tray.
     assert station.objects_in_contact(station.plant_context(root)) == {box.name, other.name}
+
+
+def test_forces_on_a_jaw_are_opposite_to_those_on_the_object() -> None:
+    """The top of the box is 3 mm above the lowest corner of the tilted jaw.
+
+    The force on the jaw is opposite to that which changes the momentum of the box.
+    """
+    cell = load_cell(resource_path("models/cells/ur10_2f85_tray.yaml"))
+    station, root = station_at_home(SCENE, cell=cell)
+    context = station.plant_context(root)
+    inspector = station.scene_plant.scene_graph.model_inspector()
+    body = station.plant.GetBodyByName("left_jaw", station.arm.gripper)
+    (geometry,) = station.plant.GetCollisionGeometriesForBody(body)
+    shape = inspector.GetShape(geometry)
+    half = np.array([shape.width(), shape.depth(), shape.height()]) / 2
+    X_TJ = body.EvalPoseInWorld(context) @ inspector.GetPoseInFrame(geometry)
+    x, y, z = X_TJ @ (-np.sign(X_TJ.rotation().matrix()[2]) * half)
+    box, other = SCENE.objects
+    below = replace(box, X_TO=Pose((x, y, z - box.X_TO.p[2] + 0.003), box.X_TO.quaternion))
+    station.set_state(root, HOME, [below, other])
+    Simulator(station, root).AdvanceTo(TIME_STEP)
+    forces = station.contact_forces(station.plant_context(root), "left_jaw")
+    assert forces.keys() == {box.name}
+    assert forces[box.name][2] > 1.0
+    velocity = station.scene_plant.bodies[box.name].EvalSpatialVelocityInWorld(context)
+    acceleration = velocity.translational() / TIME_STEP + np.array([0.0, 0.0, GRAVITY])
+    assert forces[box.name] == pytest.approx(-box.object_class.mass * acceleration, rel=1e-3)
+    assert station.contact_forces(station.plant_context(root), "right_jaw") == {}

@@ -104,6 +104,12 @@ def test_a_small_overlap_gap_and_tilt_are_allowed() -> None:
         tilted(BOX, 4.9, (0.2, -0.2)),
     ):
         assert check("sugar_box", X_TO) is None
+    for X_TO in (
+        Pose((0.2, -0.2, HEIGHT - 0.0006), BOX.X_TO.quaternion),
+        Pose((0.2, -0.2, HEIGHT + 0.0051), BOX.X_TO.quaternion),
+        tilted(BOX, 5.1, (0.2, -0.2)),
+    ):
+        assert check("sugar_box", X_TO) is not None
     above = Pose((0.2, -0.2, HEIGHT + 0.03), BOX.X_TO.quaternion)
     assert check("sugar_box", above, max_drop=0.026) is None
     assert check("sugar_box", above, max_drop=0.024) is not None
