@@ -1,4 +1,4 @@
-"""Loads that known objects carry, by hand calculation of centers of mass."""
+"""Loads that known objects carry: expected values from manual sums of centers of mass."""
 
 from conftest import resting
 

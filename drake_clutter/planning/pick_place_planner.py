@@ -232,7 +232,7 @@ class PickPlacePlanner(MoveFinder):
         Args:
             state: State at the start.
             goal: Joint positions [rad], shape (n,), or pose X_TG of the tool.
-            tool: Name of the tool; None for the one that holds the object, or else the first.
+            tool: Name of the tool. None: the tool that holds the object; the first without one.
             occluded: Occluded volumes, which count as obstacles.
 
         Raises:
