@@ -338,7 +338,9 @@ def page() -> str:
     intro = (
         "# Arm\n\nPlanning and simulated execution of pick-and-place moves "
         "([motion planning](../explanation/motion_planning.md), "
-        "[arm simulation](../explanation/arm_simulation.md)). Intervals are 95 %.\n\n"
+        "[arm simulation](../explanation/arm_simulation.md)). Intervals are 95 %. Unless stated, "
+        "placements are those of the rule *outermost* ([exploration](exploration.md)), bellows do "
+        "not bend, and carries keep no clearance from hidden objects.\n\n"
     )
     sections = [_moves(), _limits(), _parts(), _grasps(), _grippers()]
     if has_benchmark_results(PEERS):
