@@ -39,8 +39,8 @@ def _episodes() -> str:
         "Drake. "
         "*Cups*: of the tool, one of 25 mm, or another of 6 mm beside it. "
         "Rows with one cup and those without an arm were recorded with the placement rule "
-        "*outermost* ([exploration](exploration.md)), bellows that do not bend, and carries without "
-        "clearance from hidden objects. "
+        "*outermost* ([exploration](exploration.md)), bellows that do not bend, and carries "
+        "without clearance from hidden objects. "
         "*Reachable by suction*: fraction of the scenes in which no object stays hidden behind "
         "objects that no cup can hold. Intervals are 95 %.",
         command="python training/evaluate_closed_loop.py runs/closed_loop --workers 2",
