@@ -13,7 +13,7 @@ from scipy.stats import qmc
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.arm_dynamics import arm_dynamics
-from drake_clutter.planning.collision_model import CollisionModel, SignedDistance
+from drake_clutter.planning.collision_model import VIEW, CollisionModel, SignedDistance
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.time_parameterization import linear_joint_path, min_travel_time
 from drake_clutter.planning.tool_kinematics import ToolKinematics, downward_pose
@@ -74,7 +74,7 @@ class HomeSearch:
         self._robot = load_robot(cell.robot)
         self._cell = cell
         self._tool = ToolKinematics(cell, next(iter(cell.gripper.tools)))
-        self._collision_model = CollisionModel(cell, (), views=[view_corners(cell)])
+        self._collision_model = CollisionModel(cell, (), view=view_corners(cell))
 
     def find_obstacle(self, q: Floats) -> SignedDistance | None:
         """Return what is closest to the arm, if it is closer than the planner allows.
@@ -138,7 +138,7 @@ class HomeSearch:
     def _is_clear_of_cell(self, q: Floats) -> bool:
         """Return whether the arm is clear of all but the camera's view."""
         pairs = self._collision_model.distances_below(q, PlannerConfig().min_distance)
-        return all("view_0" in pair.pair for pair in pairs)
+        return all(VIEW in pair.pair for pair in pairs)
 
     def _candidates(self) -> Floats:
         """Return clear configurations within joint and half the torque limits. Shape (m, n)."""
@@ -166,4 +166,4 @@ class HomeSearch:
         pairs = {
             self._collision_model.signed_distance(found, k).pair for k in range(len(found.rows))
         }
-        return all("view_0" in pair for pair in pairs)
+        return all(VIEW in pair for pair in pairs)

@@ -37,6 +37,9 @@ from drake_clutter.simulation.scene_plant import add_scene_plant, get_support_bo
 
 Floats = NDArray[np.float64]
 
+VIEW = "view"
+"""Name of the volume that a camera looks through."""
+
 _OCCLUDED_PREFIX = "unseen_"
 """Prefix of the geometries of occluded volumes."""
 
@@ -82,7 +85,7 @@ class CollisionModel:
         cell: WorkCell,
         objects: Sequence[tuple[str, ObjectClass]],
         occluded: Sequence[OccludedBox] = (),
-        views: Sequence[Floats] = (),
+        view: Floats | None = None,
     ) -> None:
         """Build the model.
 
@@ -90,8 +93,8 @@ class CollisionModel:
             cell: Work cell with the arm.
             objects: Name and class of each object.
             occluded: Occluded volumes, which count as obstacles.
-            views: Corners in T of convex volumes that a camera looks through, which count as
-                obstacles [m]. Shapes (m, 3).
+            view: Corners in T of the convex volume that a camera looks through, which counts as the
+                obstacle `VIEW` [m]; None for no such volume. Shape (m, 3).
         """
         self._robot = load_robot(cell.robot)
         self._tools = cell.gripper.tools
@@ -110,12 +113,12 @@ class CollisionModel:
                 f"{_OCCLUDED_PREFIX}{k}",
                 CoulombFriction(1.0, 1.0),
             )
-        for k, corners in enumerate(views):
+        if view is not None:
             plant.RegisterCollisionGeometry(
                 plant.world_body(),
                 RigidTransform(),
-                Convex(corners.T, f"view_{k}"),
-                f"view_{k}",
+                Convex(view.T, VIEW),
+                VIEW,
                 CoulombFriction(1.0, 1.0),
             )
         plant.Finalize()
