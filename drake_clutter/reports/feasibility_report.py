@@ -3,7 +3,7 @@
 import base64
 import io
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -25,6 +25,13 @@ from drake_clutter.reports.feasibility_figures import (
     plot_noise,
     plot_ranking,
     plot_reachability,
+)
+from drake_clutter.reports.feasibility_tables import (
+    comparisons_table,
+    margins_table,
+    sequences_table,
+    setups_table,
+    targets_table,
 )
 from drake_clutter.reports.scene_images import SceneRenderer
 from drake_clutter.scenes.scene import Scene
@@ -143,20 +150,20 @@ def _summary_parts(results: StudyResults) -> Iterable[str]:
         "on top, a tool holds it, and there is a free place. All shares are of the possible moves. "
         "Intervals take the scenes as the sample.</p>"
     )
-    yield _setups_table(results)
+    yield setups_table(summary, results.setups)
     if summary["unstable_scenes"]:
         excluded = escape(", ".join(summary["unstable_scenes"]))
         yield f"<p>Excluded, because they are unstable: {excluded}.</p>"
     if summary["comparisons"]:
         yield "<h2>Differences between setups</h2>"
-        yield _comparisons_table(summary["comparisons"])
+        yield comparisons_table(summary["comparisons"])
     yield "<h2>Margins of the planned moves</h2>"
-    yield _margins_table(summary)
+    yield margins_table(summary)
     if results.sequences:
         yield "<h2>Searches of whole scenes</h2>"
-        yield _sequences_table(summary)
+        yield sequences_table(summary)
     if results.targets:
-        yield f"<h2>Target poses</h2>{_targets_table(results.targets)}"
+        yield f"<h2>Target poses</h2>{targets_table(results.targets)}"
 
 
 def _figure_parts(results: StudyResults) -> Iterable[str]:
@@ -222,178 +229,6 @@ def _case_parts(results: StudyResults, load_scene: Callable[[str], Scene]) -> It
 
 def _number(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
-
-
-def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table of texts, which scrolls sideways where it is too wide."""
-    head = "".join(f"<th>{escape(column)}</th>" for column in columns)
-    body = "".join(
-        f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows
-    )
-    return f'<div class="scroll"><table><tr>{head}</tr>{body}</table></div>'
-
-
-def _format(value: float | None, digits: int, unit: str = "") -> str:
-    return "-" if value is None else f"{value:.{digits}f}{unit}"
-
-
-def _interval(bounds: Sequence[float] | None, digits: int = 3) -> str:
-    return "" if bounds is None else f" ({bounds[0]:.{digits}f} to {bounds[1]:.{digits}f})"
-
-
-def _setups_table(results: StudyResults) -> str:
-    rows = []
-    summary = results.summary
-    by_name = {setup["name"]: setup for setup in summary["setups"]}
-    order = [*summary["ranking"], *(name for name in by_name if name not in summary["ranking"])]
-    for place, name in enumerate(order, start=1):
-        setup = by_name[name]
-        if setup["unusable"] is not None:
-            rows.append(("", name, setup["unusable"], *[""] * 7))
-            continue
-        cell = results.setups[name]
-        base = (*cell.robot.base.translation, cell.robot.base.rpy_deg[2])
-        impossible = ", ".join(f"{n} {reason}" for reason, n in setup["impossible"].items())
-        rows.append(
-            (
-                str(place) if name in summary["ranking"] else "",
-                name,
-                ", ".join(f"{value:.4g}" for value in base),
-                f"{cell.robot.payload:g} kg",
-                "given" if setup["home"]["is_given"] else "searched",
-                f"{setup['planned']} of {setup['possible']}",
-                _format(setup["share"], 3) + _interval(setup["share_ci95"]),
-                impossible or "none",
-                _format(setup["cycle_s"]["median"], 2, " s"),
-                _format(setup["planning_s"]["median"], 3, " s"),
-            )
-        )
-    columns = (
-        "rank",
-        "setup",
-        "base x, y, z [m], yaw [deg]",
-        "payload",
-        "home",
-        "planned of possible",
-        "share (95 % interval)",
-        "legal, but impossible",
-        "cycle time, median",
-        "planning time, median",
-    )
-    return _table(columns, rows)
-
-
-def _comparisons_table(comparisons: Rows) -> str:
-    rows = [
-        (
-            row["first"],
-            row["second"],
-            str(row["possible_in_both"]),
-            str(row["planned_by_first_only"]),
-            str(row["planned_by_second_only"]),
-            _format(row["difference"], 3) + _interval(row["difference_ci95"]),
-        )
-        for row in comparisons
-    ]
-    columns = (
-        "first",
-        "second",
-        "possible in both",
-        "planned by the first only",
-        "by the second only",
-        "difference of the shares (95 % interval)",
-    )
-    return _table(columns, rows)
-
-
-def _margins_table(summary: Row) -> str:
-    rows = []
-    for setup in summary["setups"]:
-        if not setup["planned"]:
-            continue
-        margins = setup["margins"]
-
-        def pair(name: str, digits: int, scale: float, found: Row = margins) -> str:
-            low, middle = found[name]["p05"], found[name]["median"]
-            return ", ".join(_format(v if v is None else scale * v, digits) for v in (low, middle))
-
-        def shares(name: str, found: Row = margins) -> str:
-            values = (found[name][key] for key in ("median", "p95", "largest"))
-            return ", ".join(_format(None if v is None else 100 * v, 0, " %") for v in values)
-
-        rows.append(
-            (
-                setup["name"],
-                pair("clearance", 0, 1000),
-                pair("joint_margin", 2, 1),
-                pair("singular_value", 3, 1),
-                pair("manipulability", 4, 1),
-                shares("torque_share"),
-                shares("load_share"),
-            )
-        )
-    columns = (
-        "setup",
-        "clearance [mm]: 5 %, median (-: above 30)",
-        "to joint limits [rad]: 5 %, median",
-        "smallest singular value: 5 %, median",
-        "manipulability: 5 %, median",
-        "torque of its limit: median, 95 %, largest",
-        "acceleration of what the tool holds: median, 95 %, largest",
-    )
-    return _table(columns, rows)
-
-
-def _sequences_table(summary: Row) -> str:
-    rows = []
-    for setup in summary["setups"]:
-        found = setup["sequences"]
-        if found is None:
-            continue
-        rows.append(
-            (
-                setup["name"],
-                f"{found['solved']} of {found['scenes']}",
-                _format(found["solved_share"], 2) + _interval(found["solved_ci95"], 2),
-                _format(found["minutes_of_solved"]["median"], 2, " min"),
-                _format(found["moves_of_solved"]["median"], 0),
-                str(found["not_planned"]),
-                ", ".join(f"{n} {ended}" for ended, n in found["ended"].items()),
-            )
-        )
-    columns = (
-        "setup",
-        "scenes searched to the end",
-        "share (95 % interval)",
-        "robot time of these, median",
-        "moves of these, median",
-        "moves without a plan",
-        "ends",
-    )
-    return _table(columns, rows)
-
-
-def _targets_table(targets: Rows) -> str:
-    rows = [
-        (
-            target["setup"],
-            target["target"],
-            "yes" if target["reachable"] else "no",
-            str(target["num_solutions"]),
-            _format(target["singular_value"], 3),
-            target["obstacles"] or ("" if target["reachable"] else "out of reach"),
-        )
-        for target in targets
-    ]
-    columns = (
-        "setup",
-        "target pose",
-        "reachable",
-        "IK solutions",
-        "smallest singular value",
-        "bodies in collision",
-    )
-    return _table(columns, rows)
 
 
 def _embedded_image(png: bytes, alt: str) -> str:

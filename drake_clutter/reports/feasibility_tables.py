@@ -1,0 +1,168 @@
+"""Tables of a feasibility study's page."""
+
+from collections.abc import Mapping, Sequence
+from html import escape
+
+from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.reports.feasibility_figures import Row, Rows
+
+
+def _table(rows: Sequence[Mapping[str, str]]) -> str:
+    """Return a table, which scrolls sideways where it is too wide.
+
+    Args:
+        rows: Texts by column. The first row has all columns; cells that others lack are empty.
+    """
+    if not rows:
+        return ""
+    columns = [*rows[0]]
+    head = "".join(f"<th>{escape(column)}</th>" for column in columns)
+    lines = [[escape(row.get(column, "")) for column in columns] for row in rows]
+    body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in line)}</tr>" for line in lines)
+    return f'<div class="scroll"><table><tr>{head}</tr>{body}</table></div>'
+
+
+def _format(value: float | None, digits: int, unit: str = "") -> str:
+    return "-" if value is None else f"{value:.{digits}f}{unit}"
+
+
+def _with_interval(value: float | None, bounds: Sequence[float] | None, digits: int = 3) -> str:
+    interval = "" if bounds is None else f" ({bounds[0]:.{digits}f} to {bounds[1]:.{digits}f})"
+    return _format(value, digits) + interval
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in counts.items())
+
+
+def setups_table(summary: Row, cells: Mapping[str, WorkCell]) -> str:
+    """Return the table of the setups, best first.
+
+    Args:
+        summary: Document of `summary.json`.
+        cells: Work cells of the setups that could be studied, by name.
+    """
+    by_name = {setup["name"]: setup for setup in summary["setups"]}
+    ranking = summary["ranking"]
+    order = [*ranking, *(name for name in by_name if name not in ranking)]
+    usable = [by_name[name] for name in order if by_name[name]["unusable"] is None]
+    rows = [_setup_row(setup, cells[setup["name"]], ranking) for setup in usable]
+    unusable = [
+        {"setup": name, "why it is not studied": setup["unusable"]}
+        for name, setup in by_name.items()
+        if setup["unusable"] is not None
+    ]
+    return _table(rows) + _table(unusable)
+
+
+def _setup_row(setup: Row, cell: WorkCell, ranking: Sequence[str]) -> dict[str, str]:
+    name = setup["name"]
+    base = (*cell.robot.base.translation, cell.robot.base.rpy_deg[2])
+    return {
+        "rank": str(ranking.index(name) + 1) if name in ranking else "",
+        "setup": name,
+        "base x, y, z [m], yaw [deg]": ", ".join(f"{value:.4g}" for value in base),
+        "payload": f"{cell.robot.payload:g} kg",
+        "home": "given" if setup["home"]["is_given"] else "searched",
+        "planned of possible": f"{setup['planned']} of {setup['possible']}",
+        "share (95 % interval)": _with_interval(setup["share"], setup["share_ci95"]),
+        "legal, but impossible": _counts(setup["impossible"]) or "none",
+        "cycle time, median": _format(setup["cycle_s"]["median"], 2, " s"),
+        "planning time, median": _format(setup["planning_s"]["median"], 3, " s"),
+    }
+
+
+def comparisons_table(comparisons: Rows) -> str:
+    """Return the table of pairs of setups.
+
+    Args:
+        comparisons: `comparisons` of `summary.json`.
+    """
+    return _table(
+        [
+            {
+                "first": row["first"],
+                "second": row["second"],
+                "possible in both": str(row["possible_in_both"]),
+                "planned by the first only": str(row["planned_by_first_only"]),
+                "by the second only": str(row["planned_by_second_only"]),
+                "difference of the shares (95 % interval)": _with_interval(
+                    row["difference"], row["difference_ci95"]
+                ),
+            }
+            for row in comparisons
+        ]
+    )
+
+
+def margins_table(summary: Row) -> str:
+    """Return the table of the margins of the planned moves."""
+    return _table([_margins_row(setup) for setup in summary["setups"] if setup["planned"]])
+
+
+def _margins_row(setup: Row) -> dict[str, str]:
+    margins = setup["margins"]
+
+    def low_and_median(name: str, digits: int, scale: float = 1.0) -> str:
+        values = (margins[name][key] for key in ("p05", "median"))
+        return ", ".join(_format(None if v is None else scale * v, digits) for v in values)
+
+    def shares(name: str) -> str:
+        values = (margins[name][key] for key in ("median", "p95", "largest"))
+        return ", ".join(_format(None if v is None else 100 * v, 0, " %") for v in values)
+
+    return {
+        "setup": setup["name"],
+        "clearance [mm]: 5 %, median (-: above 30)": low_and_median("clearance", 0, 1000),
+        "to joint limits [rad]: 5 %, median": low_and_median("joint_margin", 2),
+        "smallest singular value: 5 %, median": low_and_median("singular_value", 3),
+        "manipulability: 5 %, median": low_and_median("manipulability", 4),
+        "torque of its limit: median, 95 %, largest": shares("torque_share"),
+        "acceleration of what the tool holds: median, 95 %, largest": shares("load_share"),
+    }
+
+
+def sequences_table(summary: Row) -> str:
+    """Return the table of the searches of whole scenes."""
+    found = {setup["name"]: setup["sequences"] for setup in summary["setups"]}
+    return _table(
+        [
+            {
+                "setup": name,
+                "scenes searched to the end": f"{searches['solved']} of {searches['scenes']}",
+                "share (95 % interval)": _with_interval(
+                    searches["solved_share"], searches["solved_ci95"], 2
+                ),
+                "robot time of these, median": _format(
+                    searches["minutes_of_solved"]["median"], 2, " min"
+                ),
+                "moves of these, median": _format(searches["moves_of_solved"]["median"], 0),
+                "moves without a plan": str(searches["not_planned"]),
+                "ends": _counts(searches["ended"]),
+            }
+            for name, searches in found.items()
+            if searches is not None
+        ]
+    )
+
+
+def targets_table(targets: Rows) -> str:
+    """Return the table of the target poses.
+
+    Args:
+        targets: Rows of `targets.csv`.
+    """
+    return _table(
+        [
+            {
+                "setup": target["setup"],
+                "target pose": target["target"],
+                "reachable": "yes" if target["reachable"] else "no",
+                "IK solutions": str(target["num_solutions"]),
+                "smallest singular value": _format(target["singular_value"], 3),
+                "bodies in collision": target["obstacles"]
+                or ("" if target["reachable"] else "out of reach"),
+            }
+            for target in targets
+        ]
+    )
