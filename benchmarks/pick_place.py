@@ -33,12 +33,13 @@ from drake_clutter.planning.cubic_spline import CubicSpline
 from drake_clutter.planning.motion_limits import MotionLimits
 from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.planning.segment_planner import INFLUENCE_DISTANCE, MAX_REPORTED_DISTANCE
+from drake_clutter.planning.segment_planner import MAX_REPORTED_DISTANCE
 from drake_clutter.planning.time_parameterization import (
     bspline_path,
     parameterize_time_optimal,
     sample_path,
 )
+from drake_clutter.planning.trajectory_optimization import INFLUENCE_DISTANCE
 from drake_clutter.records import partial_records
 from drake_clutter.scenes.interfaces import Move, Observation, PickPlaceCommand
 from drake_clutter.scenes.placement import resolve_placement

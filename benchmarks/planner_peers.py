@@ -49,7 +49,6 @@ from drake_clutter.planning.motion_plan import CellState, HeldObject
 from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.planning.segment_planner import INFLUENCE_DISTANCE
 from drake_clutter.planning.time_parameterization import (
     MAX_JOINT_STEP,
     bspline_path,
@@ -57,6 +56,7 @@ from drake_clutter.planning.time_parameterization import (
     parameterize_time_optimal,
     sample_path,
 )
+from drake_clutter.planning.trajectory_optimization import INFLUENCE_DISTANCE
 from drake_clutter.records import partial_records
 from drake_clutter.robots.robot_model import RobotModel, load_robot
 from drake_clutter.validation import to_plain

@@ -15,6 +15,7 @@ from drake_clutter.cell.gripper import Grasp, Payload
 from drake_clutter.cell.support_sdf import FLOOR
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.collision_model import CollisionModel
+from drake_clutter.planning.grasp_candidate import EndpointContext, GraspCandidate
 from drake_clutter.planning.motion_plan import CellState, HeldObject
 from drake_clutter.planning.pick_place_plan import (
     FailureLog,
@@ -25,8 +26,6 @@ from drake_clutter.planning.pick_place_plan import (
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.segment_planner import (
     CONTACT_TOLERANCE,
-    EndpointContext,
-    GraspCandidate,
     SegmentPlanner,
 )
 from drake_clutter.planning.time_parameterization import min_travel_time
@@ -361,7 +360,7 @@ class PickPlaceSearch:
             path = tool.carry_path(*ends, height, candidate.q_pick, candidate.q_place)
             if isinstance(path, str):
                 break
-            shortfall = -self._segments.column_slack(candidate, path.waypoints)
+            shortfall = -self._segments.carry_columns(candidate).slack(path.waypoints)
             if shortfall <= 0:
                 break
             height += shortfall

@@ -6,19 +6,18 @@ Frames: T is the support, G is a tool of the gripper, O is the picked object.
 import math
 from collections.abc import Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import chain, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.planning.carry_clearance import CarriedBox, Column, columns_below, worst_slack
+from drake_clutter.planning.carry_columns import CarryColumns
 from drake_clutter.planning.collision_model import CollisionModel, SignedDistance
 from drake_clutter.planning.cubic_spline import CubicSpline
+from drake_clutter.planning.grasp_candidate import EndpointContext, GraspCandidate
 from drake_clutter.planning.motion_limits import LimitViolation, MotionLimits, scale_to_limits
 from drake_clutter.planning.pick_place_plan import (
     DESCENT_SPEED,
@@ -38,10 +37,10 @@ from drake_clutter.planning.time_parameterization import (
 from drake_clutter.planning.tool_kinematics import (
     CarryPath,
     ToolKinematics,
-    is_vertical,
     raise_pose,
 )
 from drake_clutter.planning.trajectory_optimization import (
+    INFLUENCE_DISTANCE,
     MIN_AXIAL_TRAVEL,
     LinearizedDistances,
     TrajectoryOptimizationProblem,
@@ -61,10 +60,6 @@ poses of objects at rest have slight penetrations."""
 OPTIMIZATION_MARGIN = 0.005
 """Distance that trajectory optimization keeps in addition to `PlannerConfig.min_distance` [m]. It
 imposes distances at few points; the check afterwards is dense."""
-COLUMN_MARGIN = 0.002
-"""Distance that trajectory optimization keeps from columns in addition to the required one [m]."""
-INFLUENCE_DISTANCE = 0.06
-"""Distances above this are ignored by trajectory optimization [m]."""
 MAX_CARRY_TILT = math.radians(0.5)
 """Largest tilt of the gripper while it carries an object [rad]; the suction cup is planned for
 vertical loads."""
@@ -78,62 +73,11 @@ _DESCENT_STEP = 0.005
 
 
 @dataclass(frozen=True)
-class GraspCandidate:
-    """Grasp at one yaw, with an inverse kinematics solution at each endpoint.
-
-    Attributes:
-        tool: Name of the tool.
-        payload: Load after the grasp.
-        X_TG_pick: Pose of the tool at the grasp. Shape (4, 4).
-        X_TG_place: Pose of the tool at the place pose. Shape (4, 4).
-        X_OG: Pose of the tool in the object.
-        insertion: Distance by which the tool reaches below the top of the object [m].
-        joints_open: Positions of the gripper's joints without the object, see `Grasp` [m].
-        joints_held: Positions of the gripper's joints with the object, see `Grasp` [m].
-        q_pick: Joint positions at the grasp [rad]. Shape (n,).
-        q_place: Joint positions at the place pose [rad]. Shape (n,).
-    """
-
-    tool: str
-    payload: Payload
-    X_TG_pick: Floats
-    X_TG_place: Floats
-    X_OG: RigidTransform
-    insertion: float
-    joints_open: tuple[float, ...]
-    joints_held: tuple[float, ...]
-    q_pick: Floats
-    q_place: Floats
-
-    @property
-    def is_tilted(self) -> bool:
-        """Whether the tool does not point down at the grasp or at the place pose."""
-        return not (is_vertical(self.X_TG_pick) and is_vertical(self.X_TG_place))
-
-
-@dataclass(frozen=True)
 class _FreePath:
     """Path that is free of collisions, with its smallest signed distance."""
 
     path: CubicSpline
     min_distance: SignedDistance
-
-
-@dataclass(frozen=True)
-class EndpointContext:
-    """Distances that are allowed near the pick or the place pose.
-
-    Attributes:
-        tool: Name of the tool that grasps the object.
-        p_TG_xy: Horizontal position of the tool at the endpoint [m]. Shape (2,).
-        allowed_distances: Allowed distance of pairs at the endpoint [m]: between the attached
-            object and each body that it touches there, and between the gripper and each body below
-            a thin object, by names.
-    """
-
-    tool: str
-    p_TG_xy: Floats
-    allowed_distances: Mapping[tuple[str, str], float]
 
 
 class SegmentPlanner:
@@ -183,7 +127,7 @@ class SegmentPlanner:
             name: config.carry_clearance.of_load(cell.gripper.sag(name, mass)) for name in tools
         }
         self._limits = dict[Payload, MotionLimits]()
-        self._columns_of: tuple[GraspCandidate, tuple[Column, ...]] | None = None
+        self._columns: dict[GraspCandidate, CarryColumns] = {}
         self._grasp_contacts = {
             name: [(link, picked.name) for link in tool.contact_links]
             for name, tool in cell.gripper.tools.items()
@@ -438,7 +382,7 @@ class SegmentPlanner:
         if segment_name != "carry":
             context = self._arm_context(segment_name, endpoints)
             return self.min_distance_along(points, context, progress, segment_name)
-        slack = self.column_slack(candidate, points)
+        slack = self.carry_columns(candidate).slack(points)
         if slack < 0:
             detail = f"carry: {self._picked.name} and what may be below it"
             self._failures.record(progress, PlanningFailureReason.IN_COLLISION, detail, slack)
@@ -480,69 +424,22 @@ class SegmentPlanner:
             )
         return tilt > MAX_CARRY_TILT
 
-    def _columns(self, candidate: GraspCandidate) -> tuple[Column, ...]:
-        """Return the space below the object that something may occupy where it is at rest."""
-        if self._columns_of is not None and self._columns_of[0] is candidate:
-            return self._columns_of[1]
-        below_pick, below_place = columns_below(
-            self._picked,
-            replace(self._picked, X_TO=self._X_TO_place),
-            candidate.X_OG,
-            np.array([candidate.X_TG_pick, candidate.X_TG_place]),
-            self._config.carry_clearance,
-        )
-        columns = (
-            below_pick if self._start is not None else None,
-            below_place if self._releases else None,
-        )
-        self._columns_of = candidate, tuple(column for column in columns if column is not None)
-        return self._columns_of[1]
-
-    def _column_clearance(self, candidate: GraspCandidate) -> float:
-        """Return the height that a carried object keeps above columns [m]."""
-        return self._config.min_distance + self.load_distance(candidate.tool)
-
-    def _carried_box(self, candidate: GraspCandidate, path: Floats) -> CarriedBox:
-        """Return the box of the carried object along a path. Shape (m, n)."""
-        X_TG = self._tools[candidate.tool].pose(path)
-        return CarriedBox.along(self._picked.object_class, candidate.X_OG, X_TG)
-
-    def column_slack(self, candidate: GraspCandidate, path: Floats) -> float:
-        """Return how far a path is from violating the clearance of the columns, see `worst_slack`.
-
-        Args:
-            candidate: Grasp.
-            path: Configurations with the object. Shape (m, n).
-        """
-        return worst_slack(
-            self._columns(candidate),
-            self._carried_box(candidate, path),
-            self._column_clearance(candidate),
-            self._config.carry_clearance.max_drift,
-        )
-
-    def _column_distances(self, candidate: GraspCandidate, q: Floats) -> LinearizedDistances:
-        """Return the distances of the carried object from columns, for the optimization.
-
-        Args:
-            candidate: Grasp.
-            q: Configurations. Shape (m, n).
-        """
-        box = self._carried_box(candidate, q)
-        clearance = self._column_clearance(candidate)
-        slacks = [column.slack(box, clearance, 0.0) for column in self._columns(candidate)]
-        J = self._tools[candidate.tool].jacobians(q)
-        moments = [np.cross(slack.points - box.p_TG, slack.directions) for slack in slacks]
-        gradients = np.vstack(
-            [
-                np.einsum("mi,mij->mj", np.hstack([moment, slack.directions]), J)
-                for moment, slack in zip(moments, slacks, strict=True)
-            ]
-        )
-        values = np.concatenate([slack.values for slack in slacks]) - COLUMN_MARGIN
-        is_near = values < INFLUENCE_DISTANCE
-        rows = np.tile(np.arange(len(q)), len(slacks))
-        return LinearizedDistances(rows[is_near], gradients[is_near], values[is_near])
+    def carry_columns(self, candidate: GraspCandidate) -> CarryColumns:
+        """Return what may stand below the object where a grasp picks and places it."""
+        if candidate not in self._columns:
+            self._columns = {
+                candidate: CarryColumns(
+                    self._picked,
+                    self._X_TO_place,
+                    candidate,
+                    self._tools[candidate.tool],
+                    self._config.min_distance + self.load_distance(candidate.tool),
+                    self._config.carry_clearance,
+                    starts_at_rest=self._start is not None,
+                    ends_at_rest=self._releases,
+                )
+            }
+        return self._columns[candidate]
 
     def _optimize_segment(
         self,
@@ -572,7 +469,8 @@ class SegmentPlanner:
             varies = np.abs(found.gradients).max(axis=1, initial=0.0) > 1e-6
             return LinearizedDistances(found.rows[varies], found.gradients[varies], slack[varies])
 
-        height = self._column_clearance(candidate)
+        columns = self.carry_columns(candidate)
+        height = columns.clearance
         distances = (0.0, height, height) if is_carry else MIN_AXIAL_TRAVEL
         starts_at_object = segment.name == "retreat" or (is_carry and self._start is not None)
         ends_at_object = segment.name == "approach" or (is_carry and self._releases)
@@ -587,7 +485,7 @@ class SegmentPlanner:
             max_tool_speed=limits.max_tool_speed,
             max_tool_acceleration=payload.max_axis_acceleration,
             nearby_distances=nearby_distances,
-            column_distances=partial(self._column_distances, candidate) if has_columns else None,
+            column_distances=columns.distances if has_columns else None,
             tool_jacobians=self._tools[candidate.tool].jacobians,
             tool_axis=self._tools[candidate.tool].axis,
         )

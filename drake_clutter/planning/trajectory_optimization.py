@@ -48,6 +48,8 @@ NUM_COLLISION_SAMPLES = 50
 second one."""
 CONVERGENCE_TOLERANCE = 0.02
 """Change of the control points [rad], and relative change of the duration, at convergence."""
+INFLUENCE_DISTANCE = 0.06
+"""Distances above this are ignored [m]."""
 MIN_AXIAL_TRAVEL = (0.0, 0.002)
 """Distances of the first free control points from the grasp and the place pose, on the axis of the
 tool there, if it holds nothing [m]: it leaves an object along its axis."""
