@@ -21,7 +21,7 @@ from pydrake.geometry import (
     Shape,
     Sphere,
 )
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from drake_clutter.planning.collision_model import CollisionModel
 from drake_clutter.planning.shape_table import ShapeTable
@@ -221,3 +221,28 @@ def test_penetration_of_a_held_object_is_drakes() -> None:
     assert found[box.name, "floor"] == pytest.approx(-0.0004, abs=1e-9)
     model.detach_object()
     assert (box.name, "floor") not in {d.pair for d in model.distances_below(q, 0.05)}
+
+
+def test_a_short_capsule_beside_an_edge_of_a_view() -> None:
+    """Two corners of the search's triangle are one point: its area is zero.
+
+    The closest point lies on the edge from (0, 0, 1.6) to (0.35, -0.35, 0.3), at distances a and b
+    outside the planes of its two faces, whose normals have the product g.
+    """
+    top = [(x, y, z) for x in (-0.35, 0.35) for y in (-0.35, 0.35) for z in (0.0, 0.3)]
+    pair = Pair(Capsule(0.047, 0.0022), Convex(np.array([*top, (0.0, 0.0, 1.6)]).T, "view"))
+    axes = [
+        [0.8664075606958632, 0.34347625397348475, 0.3624389627583978],
+        [0.2273727641007468, -0.9175990531503064, 0.3260576694433786],
+        [0.4445667159316204, -0.20009008124843242, -0.8731119026057137],
+    ]
+    X = RigidTransform(
+        RotationMatrix(np.array(axes)),
+        [0.16250235867494864, -0.16312998513996393, 0.9965710913590626],
+    )
+    end = X.multiply([0.0, 0.0, 0.0011])
+    normals = np.array([[1.3, 0.0, 0.35], [0.0, -1.3, 0.35]]) / math.hypot(1.3, 0.35)
+    a, b = normals @ (end - [0.0, 0.0, 1.6])
+    g = normals[0] @ normals[1]
+    expected = math.sqrt((a * a + b * b - 2 * a * b * g) / (1 - g * g)) - 0.047
+    assert pair.distance(X, RigidTransform())[0] == pytest.approx(expected, abs=2e-7)

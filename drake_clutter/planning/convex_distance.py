@@ -119,7 +119,7 @@ def _closest_weights(y, n, weights, trial, gram):  # type: ignore[no-untyped-def
             r1 = gram[a, a] - gram[a, b]
             r2 = gram[a, a] - gram[a, c]
             determinant = g11 * g22 - g12 * g12
-            if determinant < 1e-14 * g11 * g22:
+            if determinant <= 1e-14 * g11 * g22:
                 continue
             t1 = (r1 * g22 - r2 * g12) / determinant
             t2 = (r2 * g11 - r1 * g12) / determinant
