@@ -22,7 +22,7 @@ FLOORS = {
     5: {"tasks"},
     6: {"station"},
     7: {"agents", "feasibility"},
-    8: {"systems"},
+    8: {"recording", "systems"},
     9: {"__main__", "cli", "commands", "installation_check", "reports"},
 }
 FLOOR_OF = {room: floor for floor, rooms in FLOORS.items() for room in rooms}

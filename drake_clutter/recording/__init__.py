@@ -1,0 +1,1 @@
+"""Recorded episodes: every attempted move with its samples and images, and their files."""

@@ -1,0 +1,480 @@
+"""Recorded episodes as HDF5 files of version 2, which describe themselves.
+
+Attributes of the file:
+
+    version          2
+    scene            Scene before the first action, as the text of a scene file.
+    cell             `WorkCell` as YAML.
+    policy           Name of the policy.
+    termination      Why the episode ended.
+    seed             Seed of the data set; -1 if unknown.
+    index            Number of the episode in the data set.
+    scene_name       Name of the scene.
+    rate             Samples per second [Hz].
+    package_version  Version of drake_clutter.
+    drake_version    Version of Drake.
+    joint_names      Names of the arm's joints.
+    tool_names       Names of the gripper's tools.
+    object_names     Names of the objects.
+    object_classes   Their classes.
+    phases           Names of the phases.
+    frames           Meaning of the letters that name frames.
+
+Each attempted move has a group `action_0001`, `action_0002`, ... with the attributes `pick`,
+`place`, `result`, `detail`, `failure_reason`, `instability`, `tool` and `X_TO_place`. If it was
+executed, it has a dataset for each of `CHANNELS`, with the attributes `description`, `unit`,
+`frame` and `columns`, and further attributes `time_step` and `movable`. `X_WG` is a link to `X_TG`,
+because the support's frame is the world of every simulation. Images are in
+`images/CAMERA/{time, X_TC, rgb, depth, segmentation}`.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from enum import Enum
+from pathlib import Path
+from typing import Any, TypeVar
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_clutter.catalog import Catalog
+from drake_clutter.cell.work_cell import WorkCell, default_cell
+from drake_clutter.files import InputError, atomic_write, format_value, input_error, reading_file
+from drake_clutter.limits import MAX_COUNT, MAX_IMAGE_SIDE, MAX_SAMPLES, MAX_SEED
+from drake_clutter.recording.recorded_episode import (
+    CameraImages,
+    RecordedAction,
+    RecordedEpisode,
+)
+from drake_clutter.scenes.action_samples import (
+    CHANNELS,
+    PHASES,
+    POSE_COLUMNS,
+    ActionSamples,
+)
+from drake_clutter.scenes.interfaces import Move, MoveResult
+from drake_clutter.scenes.scene import Pose
+from drake_clutter.scenes.scene_file import scene_from_yaml, scene_to_yaml
+from drake_clutter.validation import config_yaml, override_config
+from drake_clutter.yaml_io import parse_yaml
+
+Floats = NDArray[np.float64]
+Choice = TypeVar("Choice", bound=Enum)
+
+FORMAT_VERSION = 2
+"""Version of the files that are written."""
+MAX_ACTIONS = 10_000
+"""Largest number of actions of an episode, which take a day."""
+MAX_RATE = 1000.0
+"""Largest number of samples per second [Hz]: more than the plant has steps."""
+MAX_TIME_STEP = 0.1
+"""Largest time step of a simulation [s]: objects fall through others within it."""
+MAX_CAMERAS = 100
+"""Largest number of cameras."""
+MAX_QUATERNION_ERROR = 0.01
+"""Largest deviation of a quaternion's norm from 1."""
+MAX_DATASET_SIZE = 2**31
+"""Largest size of an uncompressed dataset that is read [bytes]: 2,300 images of 640 by 480."""
+MAX_TEXT_LENGTH = 2**24
+"""Largest number of characters of an attribute: far more than a scene of 200 objects has."""
+FRAMES = (
+    "T: support, origin at the center of its floor, z up; W: world, the same as T; G: tool of the "
+    "gripper, z out of it; C: camera, z along its optical axis, y down; O: object. X_AB is the "
+    "pose of B in A."
+)
+"""Meaning of the letters that name frames."""
+_CONTENT = f"a recorded episode of version {FORMAT_VERSION} (HDF5)"
+_TEXTS = ("policy", "termination", "scene_name", "package_version", "drake_version")
+"""Attributes of the file with a text, which are also fields of `RecordedEpisode`."""
+_ACTION_TEXTS = ("detail", "failure_reason", "instability", "tool")
+"""Attributes of an action with a text, which are also fields of `RecordedAction`."""
+_IMAGE_UNITS = {"rgb": "", "depth": "m, or mm if integer", "segmentation": "index of object + 1"}
+"""Unit of each kind of image."""
+_IMAGE_TYPES = {
+    "rgb": ("uint8",),
+    "depth": ("float32", "uint16"),
+    "segmentation": ("uint8", "uint16"),
+}
+"""Types of each kind of image."""
+
+
+def save_episode(path: Path, episode: RecordedEpisode) -> None:
+    """Write an episode to a file, which appears when it is complete.
+
+    The same episode gives the same bytes.
+
+    Args:
+        path: File to write.
+        episode: The episode.
+    """
+    # In memory, because HDF5 reports a full disk only when it closes a file, and not as OSError.
+    with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
+        axes = episode.axes
+        cell = episode.cell.with_support(episode.initial_scene.support)
+        file.attrs.update(
+            {
+                "version": FORMAT_VERSION,
+                "scene": scene_to_yaml(episode.initial_scene, cell),
+                "cell": config_yaml(cell),
+                **{name: getattr(episode, name) for name in _TEXTS},
+                "seed": episode.seed,
+                "index": episode.index,
+                "rate": episode.rate,
+                "joint_names": axes["joints"],
+                "tool_names": axes["tools"],
+                "object_names": axes["objects"],
+                "object_classes": episode.object_classes,
+                "phases": PHASES,
+                "frames": FRAMES,
+            }
+        )
+        for number, action in enumerate(episode.actions, start=1):
+            _write_action(file.create_group(f"action_{number:04d}"), action, axes)
+        file.flush()
+        image = file.id.get_file_image()
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(image)
+
+
+def _write_action(
+    group: h5py.Group, action: RecordedAction, axes: Mapping[str, Sequence[str]]
+) -> None:
+    """Write an action to its group."""
+    place = action.X_TO_place
+    group.attrs.update(
+        {
+            "pick": action.move.pick,
+            "place": action.move.place,
+            "result": action.result.value,
+            **{name: getattr(action, name) for name in _ACTION_TEXTS},
+            "X_TO_place": (
+                np.full(len(POSE_COLUMNS), np.nan)
+                if place is None
+                else np.array([*place.quaternion, *place.translation])
+            ),
+        }
+    )
+    if action.samples is not None:
+        group.attrs["time_step"] = action.samples.time_step
+        group.attrs["movable"] = _text_array(action.samples.movable)
+        for channel in CHANNELS:
+            values = getattr(action.samples, channel.name)
+            dataset = _write_dataset(group, channel.name, values.astype(channel.dtype))
+            dataset.attrs.update(
+                {
+                    "description": channel.description,
+                    "unit": channel.unit,
+                    "frame": channel.frame,
+                    "columns": _text_array(axes[channel.axes[-1]] if channel.axes else ()),
+                }
+            )
+        group["X_WG"] = group["X_TG"]
+    for name, images in action.images.items():
+        _write_images(group.create_group(f"images/{name}"), images)
+
+
+def _text_array(texts: Iterable[str]) -> NDArray[Any]:
+    """Return texts as an array that HDF5 stores, also without any."""
+    return np.array([*texts], dtype=h5py.string_dtype())
+
+
+def _write_dataset(
+    group: h5py.Group,
+    name: str,
+    values: NDArray[Any],
+    chunks: tuple[int, ...] | bool = True,
+    level: int = 4,
+) -> h5py.Dataset:
+    """Write an array and return its dataset.
+
+    Args:
+        group: Group of the dataset.
+        name: Name of the dataset.
+        values: The array.
+        chunks: Shape of a chunk; True for one that h5py chooses.
+        level: Level of the compression.
+    """
+    if not values.size:  # HDF5 has no chunks without values
+        return group.create_dataset(name, data=values)
+    return group.create_dataset(
+        name, data=values, chunks=chunks, compression="gzip", compression_opts=level, shuffle=True
+    )
+
+
+def _write_images(group: h5py.Group, images: CameraImages) -> None:
+    """Write the images of a camera to a group; each image is a chunk of its own."""
+    group.attrs["intrinsics"] = images.intrinsics
+    time = _write_dataset(group, "time", images.time)
+    time.attrs.update({"unit": "s", "description": "time since the start of the action"})
+    pose = _write_dataset(group, "X_TC", images.X_TC)
+    pose.attrs.update({"unit": "1, m", "frame": "T", "columns": _text_array(POSE_COLUMNS)})
+    for kind, unit in _IMAGE_UNITS.items():
+        values = getattr(images, kind)
+        if values is not None:
+            dataset = _write_dataset(group, kind, values, (1, *values.shape[1:]), level=1)
+            dataset.attrs["unit"] = unit
+
+
+def load_episode(path: Path, catalog: Catalog, *, images: bool = True) -> RecordedEpisode:
+    """Read an episode.
+
+    Args:
+        path: File to read.
+        catalog: Catalog with the classes of the objects.
+        images: Whether to read the images, too.
+
+    Raises:
+        InputError: The file is not a recorded episode; names the field and what is allowed.
+    """
+    with reading_file(path, _CONTENT), h5py.File(path) as file:
+        reader = _Attributes(str(path), file.attrs)
+        version = reader.integer("version", 0, MAX_COUNT)
+        if version != FORMAT_VERSION:
+            raise input_error(str(path), f"version: {version}; expected {FORMAT_VERSION}")
+        scene = scene_from_yaml(reader.text("scene"), f"{path}:scene", catalog).scene
+        episode = RecordedEpisode(
+            initial_scene=scene,
+            cell=_read_cell(path, reader.text("cell")).with_support(scene.support),
+            actions=(),
+            **{name: reader.text(name) for name in _TEXTS},
+            seed=reader.integer("seed", -1, MAX_SEED),
+            index=reader.integer("index", 0, MAX_COUNT),
+            rate=reader.quantity("rate", MAX_RATE),
+        )
+        axes = episode.axes
+        if len(file) > MAX_ACTIONS:
+            raise input_error(str(path), f"has {len(file)} actions; expected at most {MAX_ACTIONS}")
+        expected = [f"action_{number:04d}" for number in range(1, len(file) + 1)]
+        if sorted(file) != expected:
+            problem = f"groups: {format_value([*file])}"
+            raise input_error(str(path), f"{problem}; expected {format_value(expected)}")
+        actions = tuple(
+            _ActionReader(path, file[name], name, axes).read(images=images) for name in expected
+        )
+        return replace(episode, actions=actions)
+
+
+def _read_cell(path: Path, text: str) -> WorkCell:
+    """Return the work cell of a file."""
+    source = f"{path}:cell"
+    return override_config(default_cell(), parse_yaml(text, source), source)
+
+
+class _Attributes:
+    """Attributes of a file or a group, each with a type and bounds."""
+
+    def __init__(self, source: str, attributes: Mapping[str, Any]) -> None:
+        """Take the attributes.
+
+        Args:
+            source: File and group, for messages.
+            attributes: The attributes.
+        """
+        self._source = source
+        self._attributes = attributes
+
+    def _error(self, name: str, allowed: str) -> InputError:
+        value = self._attributes.get(name)
+        shown = "is missing" if value is None else format_value(value)
+        return input_error(self._source, f"{name}: {shown}; expected {allowed}")
+
+    def text(self, name: str) -> str:
+        """Return a text."""
+        value = self._attributes.get(name)
+        if not isinstance(value, str) or len(value) > MAX_TEXT_LENGTH:
+            raise self._error(name, f"a text of at most {MAX_TEXT_LENGTH} characters")
+        return value
+
+    def texts(self, name: str, most: int) -> tuple[str, ...]:
+        """Return a list of at most `most` texts."""
+        values = self._attributes.get(name)
+        if not isinstance(values, np.ndarray) or values.ndim != 1 or len(values) > most:
+            raise self._error(name, f"a list of at most {most} texts")
+        if not all(isinstance(value, str) for value in values.tolist()):
+            raise self._error(name, f"a list of at most {most} texts")
+        return tuple(values.tolist())
+
+    def integer(self, name: str, least: int, most: int) -> int:
+        """Return an integer in [`least`, `most`]."""
+        value = self._attributes.get(name)
+        if not isinstance(value, np.integer) or not least <= value <= most:
+            raise self._error(name, f"an integer in [{least}, {most}]")
+        return int(value)
+
+    def quantity(self, name: str, most: float) -> float:
+        """Return a number in (0, `most`]."""
+        value = self._attributes.get(name)
+        if not isinstance(value, np.floating) or not 0 < value <= most:
+            raise self._error(name, f"a number in (0, {most:g}]")
+        return float(value)
+
+    def vector(self, name: str, length: int) -> Floats:
+        """Return a vector of numbers."""
+        value = self._attributes.get(name)
+        if not isinstance(value, np.ndarray) or value.shape != (length,) or value.dtype.kind != "f":
+            raise self._error(name, f"{length} numbers")
+        return np.asarray(value, np.float64)
+
+    def choice(self, name: str, enumeration: type[Choice]) -> Choice:
+        """Return the member of an enumeration of texts."""
+        value = self.text(name)
+        if value not in {member.value for member in enumeration}:
+            raise self._error(name, "one of " + ", ".join(member.value for member in enumeration))
+        return enumeration(value)
+
+
+class _ActionReader:
+    """Reads an action from its group."""
+
+    def __init__(
+        self, path: Path, group: h5py.Group, name: str, axes: Mapping[str, Sequence[str]]
+    ) -> None:
+        """Take the group.
+
+        Args:
+            path: File, for messages.
+            group: Group of the action.
+            name: Name of the group.
+            axes: See `RecordedEpisode.axes`.
+        """
+        self._path = path
+        self._source = f"{path}:{name}"
+        if not isinstance(group, h5py.Group):
+            raise input_error(self._source, "is a dataset; expected a group")
+        self._group = group
+        self._axes = axes
+        self._attributes = _Attributes(self._source, group.attrs)
+
+    def read(self, *, images: bool) -> RecordedAction:
+        """Return the action.
+
+        Args:
+            images: Whether to read its images.
+        """
+        attributes = self._attributes
+        place = attributes.vector("X_TO_place", len(POSE_COLUMNS))
+        X_TO_place = None
+        if not np.isnan(place).all():
+            self._check_poses("X_TO_place", place)
+            X_TO_place = Pose(tuple(place[4:].tolist()), tuple(place[:4].tolist()))
+        return RecordedAction(
+            Move(attributes.text("pick"), attributes.text("place")),
+            attributes.choice("result", MoveResult),
+            **{name: attributes.text(name) for name in _ACTION_TEXTS},
+            X_TO_place=X_TO_place,
+            samples=self._read_samples() if "time" in self._group else None,
+            images=self._read_images() if images and "images" in self._group else {},
+        )
+
+    def _read_samples(self) -> ActionSamples:
+        """Return the samples."""
+        objects = self._axes["objects"]
+        count = self._count(self._group, "time", MAX_SAMPLES)
+        arrays = {}
+        for channel in CHANNELS:
+            shape = (count, *(len(self._axes[axis]) for axis in channel.axes))
+            arrays[channel.name] = self._array(self._group, channel.name, shape, (channel.dtype,))
+            if channel.dtype == "float64" and not np.isfinite(arrays[channel.name]).all():
+                raise input_error(f"{self._source}.{channel.name}", "expected finite numbers")
+        self._check_times(f"{self._source}.time", arrays["time"])
+        limits = {"tool_commanded": len(self._axes["tools"]), "held_object": len(objects)}
+        for name, size in {**limits, "phase": len(PHASES)}.items():
+            if not ((arrays[name] >= -1) & (arrays[name] < size)).all():
+                raise input_error(
+                    f"{self._source}.{name}", f"expected integers in [-1, {size - 1}]"
+                )
+        for name in ("X_TG", "X_TO"):
+            self._check_poses(name, arrays[name])
+        movable = self._attributes.texts("movable", len(objects))
+        if unknown := [name for name in movable if name not in objects]:
+            problem = f"movable: {format_value(unknown[0])}"
+            raise input_error(self._source, f"{problem}; expected names of objects")
+        time_step = self._attributes.quantity("time_step", MAX_TIME_STEP)
+        return ActionSamples(**arrays, time_step=time_step, movable=movable)
+
+    def _read_images(self) -> dict[str, CameraImages]:
+        """Return the images by name of the camera."""
+        cameras = self._group["images"]
+        if not isinstance(cameras, h5py.Group) or len(cameras) > MAX_CAMERAS:
+            allowed = f"a group with at most {MAX_CAMERAS} cameras"
+            raise input_error(f"{self._source}.images", f"expected {allowed}")
+        return {name: self._read_camera(name, cameras[name]) for name in cameras}
+
+    def _read_camera(self, name: str, group: Any) -> CameraImages:
+        """Return the images of a camera."""
+        source = f"{self._source}.images/{name}"
+        if not isinstance(group, h5py.Group):
+            raise input_error(source, "is a dataset; expected a group")
+        count = self._count(group, "time", MAX_SAMPLES)
+        time = self._array(group, "time", (count,), ("float64",))
+        self._check_times(f"{source}.time", time)
+        X_TC = self._array(group, "X_TC", (count, len(POSE_COLUMNS)), ("float64",))
+        self._check_poses(f"images/{name}.X_TC", X_TC)
+        arrays = {}
+        for kind, types in _IMAGE_TYPES.items():
+            if kind in group:
+                side = getattr(group[kind], "shape", ())[1:3]
+                if len(side) != 2 or max(side) > MAX_IMAGE_SIDE:
+                    allowed = f"images with at most {MAX_IMAGE_SIDE} pixels a side"
+                    raise input_error(f"{source}.{kind}", f"expected {allowed}")
+                channels = (3,) if kind == "rgb" else ()
+                arrays[kind] = self._array(group, kind, (count, *side, *channels), types)
+        fx, fy, cx, cy = _Attributes(source, group.attrs).vector("intrinsics", 4).tolist()
+        return CameraImages(time, X_TC, (fx, fy, cx, cy), **arrays)
+
+    def _source_of(self, group: h5py.Group, name: str) -> str:
+        """Return file, group and name of a dataset, for messages."""
+        return f"{self._path}:{group.name.removeprefix('/')}.{name}"
+
+    def _count(self, group: h5py.Group, name: str, most: int) -> int:
+        """Return the length of a dataset, in [1, `most`]."""
+        shape = getattr(group.get(name), "shape", ())
+        if not shape or not 1 <= shape[0] <= most:
+            allowed = f"a dataset with 1 to {most} values"
+            raise input_error(self._source_of(group, name), f"expected {allowed}")
+        return int(shape[0])
+
+    def _array(
+        self, group: h5py.Group, name: str, shape: tuple[int, ...], types: tuple[str, ...]
+    ) -> NDArray[Any]:
+        """Return the values of a dataset, whose size is checked before it is read.
+
+        Args:
+            group: Group of the dataset.
+            name: Name of the dataset.
+            shape: Its shape.
+            types: Types that it may have.
+        """
+        dataset = group.get(name)
+        is_own = isinstance(group.get(name, getlink=True), h5py.HardLink)
+        if (
+            not isinstance(dataset, h5py.Dataset)
+            or not is_own
+            or dataset.external
+            or dataset.is_virtual
+            or dataset.shape != shape
+            or str(dataset.dtype) not in types
+        ):
+            allowed = f"a dataset of shape {shape} and type {' or '.join(types)}"
+            raise input_error(self._source_of(group, name), f"expected {allowed}")
+        if dataset.nbytes > MAX_DATASET_SIZE:
+            allowed = f"at most {MAX_DATASET_SIZE / 2**30:g} GiB"
+            raise input_error(
+                self._source_of(group, name),
+                f"has {dataset.nbytes / 2**30:.1f} GiB; expected {allowed}",
+            )
+        values: NDArray[Any] = dataset[()]
+        return values
+
+    def _check_times(self, source: str, time: Floats) -> None:
+        """Check that times are finite and increase from 0 or later."""
+        if not np.isfinite(time).all() or time[0] < 0 or (np.diff(time) <= 0).any():
+            raise input_error(source, "expected finite times that increase, from 0 or later")
+
+    def _check_poses(self, name: str, poses: Floats) -> None:
+        """Check that poses are finite and have unit quaternions."""
+        norm = np.linalg.norm(poses[..., :4], axis=-1)
+        if not np.isfinite(poses).all() or not (np.abs(norm - 1) < MAX_QUATERNION_ERROR).all():
+            allowed = "finite poses with unit quaternions"
+            raise input_error(f"{self._source}.{name}", f"expected {allowed}")
