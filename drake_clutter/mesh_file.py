@@ -25,6 +25,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from drake_clutter.files import InputError
+from drake_clutter.visual_mesh import GLTF_SUFFIXES, check_textures
 
 Floats = NDArray[np.float64]
 """An array of floats."""
@@ -52,7 +53,6 @@ It is the resolution of single precision, in which most formats store coordinate
 """
 _MIN_THICKNESS = 1e-5
 """A body whose mean thickness is smaller is a surface without volume [m]."""
-_GLTF_SUFFIXES = frozenset({".glb", ".gltf"})
 _WINDING_GRID = 64
 """Number of vertical lines a side along which winding numbers are measured."""
 MAX_INVERTED_FRACTION = 1e-3
@@ -144,6 +144,7 @@ def _read_parts(path: Path, where: str, scale: float) -> list[tuple[str, trimesh
     """Return the names and meshes of the parts of a file, z up and in meters."""
     parts = []
     with _reading_mesh(path, where):
+        check_textures(path)
         scene = trimesh.load_scene(path, process=False)
         for node in sorted(scene.graph.nodes_geometry):
             transform, geometry = scene.graph[node]
@@ -157,7 +158,7 @@ def _read_parts(path: Path, where: str, scale: float) -> list[tuple[str, trimesh
                     raise ValueError("its vertices have not three coordinates")
                 part = part.copy()
                 part.apply_transform(transform)
-                if path.suffix.lower() in _GLTF_SUFFIXES:
+                if path.suffix.lower() in GLTF_SUFFIXES:
                     part.apply_transform(Y_UP_TO_Z_UP)
                 if scale != 1:
                     part.vertices = np.asarray(part.vertices, float) * scale

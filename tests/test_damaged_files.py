@@ -50,6 +50,7 @@ from drake_clutter.agents.ppo import PPOConfig, PPOLearner
 from drake_clutter.agents.soft_q import SoftQConfig, SoftQLearner
 from drake_clutter.assets import build_assets
 from drake_clutter.assets.mesh_appearance import textured_parts
+from drake_clutter.assets.textured_mesh import gltf_text
 from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.work_cell import load_cell
 from drake_clutter.commands.feasibility_parts import PartKind, StudyPart, load_part
@@ -89,6 +90,7 @@ from drake_clutter.systems.scenario import Scenario
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.generation_task import ClutterGeneration, GenerationTaskConfig
 from drake_clutter.validation import load_config_as, override_config, to_plain
+from drake_clutter.visual_mesh import check_visual_mesh
 from drake_clutter.yaml_io import to_yaml
 from training.evaluate_explorers import EpisodeRecord
 from training.results_file import ResultsFile
@@ -569,6 +571,26 @@ def own_catalog(folder: Path) -> Reader:
     return Reader([folder / "catalog.yaml", folder / "brick.stl", *built], read)
 
 
+def visual_files(folder: Path) -> Reader:
+    """Return a reader of built and of users' visual meshes with textures."""
+    box = trimesh.creation.box((0.06, 0.04, 0.03))
+    box.unmerge_vertices()
+    uv = rng().random((len(box.vertices), 2))
+    image = Image.fromarray(rng().integers(0, 256, (24, 24, 3), np.uint8))
+    box.visual = trimesh.visual.TextureVisuals(uv=uv, image=image)  # type: ignore[no-untyped-call]
+    box.export(folder / "visual.glb")
+    parts = textured_parts(load_object_mesh(folder / "visual.glb", ""), folder / "visual.glb")
+    (folder / "visual.gltf").write_text(gltf_text(parts))
+    obj = write_cube_with_seams(folder)
+    visuals = [folder / "visual.glb", folder / "visual.gltf", obj]
+
+    def read() -> None:
+        for path in visuals:
+            check_visual_mesh(path)
+
+    return Reader([folder / "label.png", *visuals[:2]], read)
+
+
 def robot_files(folder: Path) -> Reader:
     """Return a reader of an arm in URDF and a fixture in SDF."""
     spec = arm(folder, "revolute", "0 0 1", 0.5)
@@ -587,7 +609,7 @@ def robot_files(folder: Path) -> Reader:
 
 
 READERS = [
-    *(mesh_files, own_catalog, robot_files),
+    *(mesh_files, visual_files, own_catalog, robot_files),
     *(scene_file, config_file, cell_file, generator_checkpoint, explorer_checkpoint),
     *(detector_checkpoint, trajectory_file, soft_q_training, ppo_training, cloning_training),
     *(job_file, progress_file, scene_dataset, image_dataset, record_file, results_file),

@@ -13,7 +13,7 @@ FLOORS = {
     0: {
         *("assets", "built_mesh", "catalog", "compilation", "files", "learning", "limits"),
         *("mesh_file", "outputs", "records", "resources", "seeding", "statistics"),
-        *("validation", "workers", "yaml_io"),
+        *("validation", "visual_mesh", "workers", "yaml_io"),
     },
     1: {"cell", "config", "grammar"},
     2: {"robots", "scenes", "stability"},

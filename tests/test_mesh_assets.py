@@ -3,6 +3,9 @@
 # trimesh is typed in part only.
 # mypy: allow-untyped-calls
 
+import base64
+import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +30,7 @@ from drake_clutter.files import InputError
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.camera_renderer import CameraRenderer
 from drake_clutter.simulation.drake_judge import DrakeJudge
+from drake_clutter.visual_mesh import check_visual_mesh
 
 FACE_COLORS = np.array(
     [[200, 30, 30], [30, 200, 30], [30, 30, 200], [200, 200, 30], [30, 200, 200], [200, 30, 200]]
@@ -118,8 +122,80 @@ def test_vertex_colors_are_kept(tmp_path: Path) -> None:
 def test_a_missing_texture_is_refused(tmp_path: Path) -> None:
     write_cube_with_seams(tmp_path)
     (tmp_path / "label.png").unlink()
-    with pytest.raises(InputError, match=r"texture label\.png is missing"):
+    with pytest.raises(InputError, match=r"file label\.png is missing"):
         own_class(tmp_path, "cube.obj")
+
+
+def cut_png(data: bytes) -> bytes:
+    """Return a PNG file without its last quarter."""
+    return data[: 3 * len(data) // 4]
+
+
+def without_end(data: bytes) -> bytes:
+    """Return a PNG file without the end of its last chunk."""
+    return data[:-4]
+
+
+def with_wrong_pixel(data: bytes) -> bytes:
+    """Return a PNG file with a bit of its pixels changed."""
+    middle = len(data) // 2
+    return data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :]
+
+
+@pytest.mark.parametrize("damage", [cut_png, without_end, with_wrong_pixel])
+@pytest.mark.parametrize("name", ["box.obj", "box.glb"])
+def test_a_damaged_texture_is_refused(
+    tmp_path: Path, name: str, damage: Callable[[bytes], bytes]
+) -> None:
+    """trimesh would leave it out, and VTK end the process."""
+    painted_box().export(tmp_path / name)
+    own = own_class(tmp_path, name)
+    visual = own.folder / "visual.gltf"
+    document = json.loads(visual.read_text())
+    kind, _, png = document["images"][0]["uri"].partition(",")
+    damaged = base64.b64encode(damage(base64.b64decode(png))).decode()
+    document["images"][0]["uri"] = f"{kind},{damaged}"
+    visual.write_text(json.dumps(document))
+    match = r"visual\.gltf: images\.0: cannot be read .*; expected an image, such as PNG or JPEG"
+    for use in (lambda: seen_color(own, np.eye(3)), lambda: load_visual(own)):
+        with pytest.raises(InputError, match=match):
+            use()
+
+    if name == "box.glb":
+        content = (tmp_path / name).read_bytes()
+        start = content.index(b"\x89PNG")
+        png_size = content.index(b"IEND", start) + 8 - start
+        png_bytes = content[start : start + png_size]
+        damaged_bytes = damage(png_bytes).ljust(png_size, b"\0")
+        (tmp_path / name).write_bytes(content.replace(png_bytes, damaged_bytes))
+    else:
+        texture = tmp_path / "material_0.png"
+        texture.write_bytes(damage(texture.read_bytes()))
+    with pytest.raises(InputError, match=r"\.(png|glb: images\.0): cannot be read"):
+        build_assets(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "reason"),
+    [
+        (("meshes", 0, "primitives", 0, "material"), 1, "it refers to material 1 of 1"),
+        (("nodes", 0, "mesh"), 2, "it refers to mesh 2 of 1"),
+        (("accessors", 0, "count"), 8, "a triangle has vertex 23 of 8"),
+    ],
+)
+def test_indices_out_of_range_in_a_visual_mesh_are_refused(
+    tmp_path: Path, key: tuple[Any, ...], value: int, reason: str
+) -> None:
+    painted_box().export(tmp_path / "box.glb")
+    path = own_class(tmp_path, "box.glb").folder / "visual.gltf"
+    check_visual_mesh(path)
+    owner = document = json.loads(path.read_text())
+    for part in key[:-1]:
+        owner = owner[part]
+    owner[key[-1]] = value
+    path.write_text(json.dumps(document))
+    with pytest.raises(InputError, match=rf"visual\.gltf: cannot be read \({reason}\)"):
+        check_visual_mesh(path)
 
 
 def test_the_inertia_of_a_mesh_with_seams_is_that_of_a_box(tmp_path: Path) -> None:

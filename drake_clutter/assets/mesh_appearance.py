@@ -12,6 +12,7 @@ from scipy.sparse import csr_array
 from drake_clutter.assets.textured_mesh import TexturedMesh
 from drake_clutter.files import InputError
 from drake_clutter.mesh_file import MeshPart, ObjectMesh
+from drake_clutter.visual_mesh import obj_companions
 
 Floats = NDArray[np.float64]
 """An array of floats."""
@@ -60,23 +61,14 @@ def _corner_normals(points: Floats, triangles: NDArray[np.int64]) -> Floats:
     return np.asarray(unit.reshape(-1, 3, 3))
 
 
-def _check_obj_textures(path: Path) -> None:
-    """Raise an error if an OBJ file names a material file or a texture that is missing.
+def _check_obj_companions(path: Path) -> None:
+    """Raise an error if a material file or a texture of an OBJ file is missing.
 
     trimesh ignores missing textures.
     """
-
-    def named_files(file: Path, keyword: str) -> list[Path]:
-        lines = (line.split() for line in file.read_text(errors="replace").splitlines())
-        return [file.parent / " ".join(w[1:]) for w in lines if len(w) > 1 and w[0] == keyword]
-
-    for materials in named_files(path, "mtllib"):
-        if not materials.is_file():
-            raise InputError(f"{path}: {materials.name} is missing; put it beside the mesh")
-        for texture in named_files(materials, "map_Kd"):
-            # A texture may have options before its name, which is the last word then.
-            if not texture.is_file() and not (path.parent / texture.name.split()[-1]).is_file():
-                raise InputError(f"{path}: texture {texture.name} is missing; put it beside it")
+    for file in obj_companions(path):
+        if not file.is_file():
+            raise InputError(f"{path}: file {file.name} is missing; put it beside the mesh")
 
 
 def _material_image(material: Any) -> Image.Image | None:
@@ -153,5 +145,5 @@ def textured_parts(mesh: ObjectMesh, path: Path) -> list[tuple[TexturedMesh, byt
         InputError: A texture or a material file is missing.
     """
     if path.suffix.lower() == ".obj":
-        _check_obj_textures(path)
+        _check_obj_companions(path)
     return [_texture_part(part) for part in mesh.parts]

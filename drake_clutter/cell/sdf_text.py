@@ -8,6 +8,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from drake_clutter.files import private_temporary_folder
+from drake_clutter.visual_mesh import check_visual_mesh
 
 _PLAIN_PATH = re.compile(r"[A-Za-z0-9._~/-]*")
 """Paths that are the same with and without percent-encoding (RFC 3986, Sec. 2.3)."""
@@ -41,6 +42,9 @@ def read_sdf_text(path: Path, *, visuals: bool) -> str:
     Args:
         path: SDF file.
         visuals: Whether to keep visual geometry.
+
+    Raises:
+        InputError: A visual mesh is damaged.
     """
     # Without registration, ElementTree would rename the prefix, which Drake would not recognize.
     ElementTree.register_namespace("drake", "drake.mit.edu")
@@ -48,6 +52,10 @@ def read_sdf_text(path: Path, *, visuals: bool) -> str:
     for link in () if visuals else root.iter("link"):
         for visual in link.findall("visual"):
             link.remove(visual)
+    for link in root.iter("link"):
+        for visual in link.findall("visual"):
+            for uri in visual.iter("uri"):
+                check_visual_mesh(path.parent / (uri.text or ""))
     for uri in root.iter("uri"):
         uri.text = mesh_uri(path.parent / (uri.text or ""))
     return ElementTree.tostring(root, encoding="unicode")

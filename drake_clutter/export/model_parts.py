@@ -22,6 +22,7 @@ from drake_clutter.cell.support_sdf import support_sdf
 from drake_clutter.files import reading_file
 from drake_clutter.mesh_file import Y_UP_TO_Z_UP
 from drake_clutter.scenes.scene import Scene
+from drake_clutter.visual_mesh import check_visual_mesh
 
 Floats = NDArray[np.float64]
 """An array of floats."""
@@ -102,6 +103,7 @@ def load_visual(object_class: ObjectClass) -> Any:
     It is a `trimesh.Trimesh` whose material is a `PBRMaterial` with the label as its texture.
     """
     path = object_class.folder / "visual.gltf"
+    check_visual_mesh(path)
     with reading_file(path, "a model as `drake-clutter assets build` writes it"):
         parts = trimesh.load_scene(path).geometry.values()
         mesh = trimesh.util.concatenate(list(parts))  # packs the textures of several parts into one

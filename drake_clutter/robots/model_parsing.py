@@ -14,6 +14,7 @@ from drake_clutter.cell.sdf_text import mesh_uri
 from drake_clutter.files import InputError, read_text
 from drake_clutter.resources import resource_path
 from drake_clutter.robots.stl_conversion import convert_stl_to_obj
+from drake_clutter.visual_mesh import check_visual_mesh
 
 PACKAGE = "drake_clutter_models"
 """ROS package name of the shipped folder `models/`."""
@@ -70,7 +71,7 @@ def read_model_text(path: Path, *, visuals: bool) -> str:
         visuals: Whether to keep visual geometry.
 
     Raises:
-        InputError: The file is not XML, or a mesh is missing.
+        InputError: The file is not XML, or a mesh is missing or, with visuals, damaged.
     """
     root = _read_xml(path)
     for link in root.iter("link"):
@@ -82,9 +83,15 @@ def read_model_text(path: Path, *, visuals: bool) -> str:
     packages = find_packages(path)
     for mesh in root.iter("mesh"):
         if (uri := mesh.find("uri")) is not None:
-            uri.text = mesh_uri(_resolve_mesh(path, (uri.text or "").strip(), packages))
+            file = _resolve_mesh(path, (uri.text or "").strip(), packages)
+            uri.text = mesh_uri(file)
         elif filename := mesh.get("filename"):
-            mesh.set("filename", mesh_uri(_resolve_mesh(path, filename, packages)))
+            file = _resolve_mesh(path, filename, packages)
+            mesh.set("filename", mesh_uri(file))
+        else:
+            continue
+        if visuals:
+            check_visual_mesh(file)
     return ElementTree.tostring(root, encoding="unicode")
 
 
