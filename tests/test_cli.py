@@ -254,7 +254,8 @@ def test_render_writes_camera_images(scene: Path, tmp_path: Path) -> None:
 def test_view_and_export_write_files(scene: Path, tmp_path: Path) -> None:
     run("view", scene, "--html", tmp_path / "scene.html")
     assert (tmp_path / "scene.html").stat().st_size > 100_000
-    run("export", scene, "--format", "mjcf", "--out", tmp_path / "mjcf")
+    run("export", scene, "--format", "mjcf", "--with-cell", "--out", tmp_path / "mjcf")
+    assert 'name="robot/' in (tmp_path / "mjcf" / "scene.xml").read_text()
     assert (tmp_path / "mjcf/scene.xml").is_file()
 
 

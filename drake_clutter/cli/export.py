@@ -28,6 +28,13 @@ def export(
             "viewers."
         ),
     ],
+    with_cell: Annotated[
+        bool,
+        typer.Option(
+            "--with-cell",
+            help="Export arm, gripper, pedestal, cameras and fixtures, too (mjcf).",
+        ),
+    ] = False,
     initial_poses: InitialPosesOption = False,
     catalog: CatalogOption = None,
 ) -> None:
@@ -41,7 +48,12 @@ def export(
     file = load_scene(scene, load_catalog(catalog))
     exported = file.scene if initial_poses else file.settled_scene
     config = ClutterConfig(cell=file.cell)
-    options = {"format": format.value, "initial_poses": initial_poses}
+    options = {
+        "format": format.value,
+        "initial_poses": initial_poses,
+        **({"with_cell": True} if with_cell else {}),
+    }
     with open_job_folder(out, scene_job("export", scene, config, catalog, **options)):
-        path = export_scene(exported, ExportFormat(format.value), out)
+        cell = file.cell if with_cell else None
+        path = export_scene(exported, ExportFormat(format.value), out, cell=cell)
     print_line(f"Wrote {path}.")

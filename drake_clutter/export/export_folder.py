@@ -6,6 +6,7 @@ import shutil
 from enum import Enum
 from pathlib import Path
 
+from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.export.dmd_writer import write_dmd
 from drake_clutter.export.glb_writer import ROOT_NODE, write_glb
 from drake_clutter.export.mjcf_writer import write_mjcf
@@ -29,15 +30,18 @@ class ExportFormat(Enum):
     GLB = "glb"
 
 
-_WRITERS = {
+_SCENE_WRITERS = {
     ExportFormat.DMD: write_dmd,
     ExportFormat.SDF: write_sdf,
-    ExportFormat.MJCF: write_mjcf,
     ExportFormat.GLB: write_glb,
 }
+_CELL_WRITERS = {ExportFormat.MJCF: write_mjcf}
+"""Writers of formats that can hold a work cell, too."""
 
 
-def export_scene(scene: Scene, format: ExportFormat, out: Path) -> Path:
+def export_scene(
+    scene: Scene, format: ExportFormat, out: Path, *, cell: WorkCell | None = None
+) -> Path:
     """Write a scene to a folder that refers to no files outside of it.
 
     The world frame of every format is the support's frame T.
@@ -47,13 +51,19 @@ def export_scene(scene: Scene, format: ExportFormat, out: Path) -> Path:
         format: The format.
         out: An existing folder, empty or of the same export, whose files are replaced. It stays
             empty if the export fails.
+        cell: Work cell to export beside the scene, with arm, gripper, pedestal, cameras and
+            fixtures; None for the scene alone, on a table.
 
     Returns:
         The file to open: `scene.dmd.yaml`, `scene.sdf`, `scene.xml` or `scene.glb` in `out`.
 
     Raises:
-        InputError: A format does not allow an object's name, or a class has no built assets.
+        InputError: A format does not allow an object's name, or cannot hold a cell; or a class has
+            no built assets.
     """
+    if cell is not None and format not in _CELL_WRITERS:
+        allowed = ", ".join(entry.value for entry in _CELL_WRITERS)
+        raise InputError(f"format: {format.value} cannot hold the cell; expected one of {allowed}")
     for name in scene.names:
         if not _VALID_NAME.fullmatch(name) or _RESERVED_NAME.fullmatch(name):
             reserved = _RESERVED_NAME.pattern.replace("|", ", ")
@@ -67,7 +77,10 @@ def export_scene(scene: Scene, format: ExportFormat, out: Path) -> Path:
     staging = temporary_path(out / "export")
     staging.mkdir()
     try:
-        main_file = _WRITERS[format](scene, staging)
+        if format in _CELL_WRITERS:
+            main_file = _CELL_WRITERS[format](scene, staging, cell)
+        else:
+            main_file = _SCENE_WRITERS[format](scene, staging)
         # The file to open is moved last, so that its presence means a complete export.
         for entry in sorted(staging.iterdir(), key=lambda entry: (entry == main_file, entry.name)):
             target = out / entry.name

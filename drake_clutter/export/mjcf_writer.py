@@ -7,6 +7,9 @@ from xml.etree.ElementTree import Element, SubElement
 from drake_clutter.assets.contact_properties import ROLLING_FRICTION, SURFACE_FRICTION
 from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.cell.support import Support
+from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.export.cell_model import read_cell_model
+from drake_clutter.export.mjcf_cell import CellWriter
 from drake_clutter.export.model_parts import (
     can_roll,
     classes_in_scene,
@@ -17,6 +20,7 @@ from drake_clutter.export.model_parts import (
     write_xml,
 )
 from drake_clutter.scenes.scene import TRAY, Scene, SceneObject
+from drake_clutter.simulation.scene_plant import rigid_transform
 
 _TORSIONAL_FRICTION = 0.005
 """MuJoCo's default coefficient of torsional friction [m]."""
@@ -76,10 +80,10 @@ def _add_assets(asset: Element, object_class: ObjectClass, pieces: Sequence[str]
         SubElement(asset, "mesh", name=f"{name}/{piece}", file=f"{name}/{piece}.obj")
 
 
-def _add_tray(worldbody: Element, support: Support) -> None:
-    """Add the support and the table under it as a fixed body."""
+def _add_tray(worldbody: Element, support: Support, *, table: bool) -> None:
+    """Add the support, and maybe the table under it, as a fixed body."""
     tray = SubElement(worldbody, "body", name=TRAY)
-    for box in support_boxes(support, table=True):
+    for box in support_boxes(support, table=table):
         geometry = {
             "type": "box",
             "size": format_numbers(box.size / 2),
@@ -128,10 +132,18 @@ def _add_object(worldbody: Element, scene_object: SceneObject, pieces: Sequence[
         SubElement(body, "geom", {"class": collision} | geometry)
 
 
-def write_mjcf(scene: Scene, folder: Path) -> Path:
+def write_mjcf(scene: Scene, folder: Path, cell: WorkCell | None) -> Path:
     """Write `scene.xml` and a folder of meshes for each class.
 
-    Visuals are in group 2, collision geometry is in group 3. Returns the path of `scene.xml`.
+    Visuals are in group 2, collision geometry is in group 3.
+
+    Args:
+        scene: Scene.
+        folder: Folder to write to.
+        cell: Work cell to write beside the scene; None for the scene alone, on a table.
+
+    Returns:
+        Path of `scene.xml`.
     """
     root = Element("mujoco", model="scene")
     SubElement(root, "compiler", angle="radian", inertiafromgeom="false")
@@ -153,9 +165,14 @@ def write_mjcf(scene: Scene, folder: Path) -> Path:
         _add_assets(asset, object_class, pieces[object_class.name])
     worldbody = SubElement(root, "worldbody")
     SubElement(worldbody, "light", pos="0 0 2", dir="0 0 -1", directional="true")
-    _add_tray(worldbody, scene.support)
+    _add_tray(worldbody, scene.support, table=cell is None)
+    cell_writer = cell and CellWriter(read_cell_model(cell), root, folder)
+    if cell_writer:
+        cell_writer.add()
     for scene_object in scene.objects:
         _add_object(worldbody, scene_object, pieces[scene_object.object_class.name])
+    if cell_writer:
+        cell_writer.add_home({o.name: rigid_transform(o.X_TO) for o in scene.objects})
     path = folder / "scene.xml"
     write_xml(path, root)
     return path

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from pydrake.geometry import Convex, Mesh
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
@@ -150,6 +151,17 @@ def deflate_convex_mesh(path: Path, deflated: Path, margin: float) -> None:
     corners = HalfspaceIntersection(faces, ball[:3]).intersections
     text = trimesh.exchange.obj.export_obj(trimesh.Trimesh(corners).convex_hull)
     deflated.write_text(text, encoding="utf-8")
+
+
+def write_shape_mesh(shape: Mesh | Convex, path: Path) -> None:
+    """Write the mesh of a shape as an OBJ file in the scale and axes of the shape."""
+    source = shape.source().path()
+    with reading_file(source, "a mesh"):
+        mesh = trimesh.load_mesh(source)
+    if source.suffix == ".gltf":
+        mesh.apply_transform(Y_UP_TO_Z_UP)
+    mesh.apply_scale(shape.scale3())
+    path.write_text(trimesh.exchange.obj.export_obj(mesh, include_texture=False), encoding="utf-8")
 
 
 def write_class_meshes(object_class: ObjectClass, folder: Path) -> list[str]:

@@ -13,7 +13,7 @@ from pydrake.geometry import Box, RoleAssign, SceneGraph, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
-from pydrake.multibody.tree import Frame, ModelInstanceIndex, RigidBody
+from pydrake.multibody.tree import Frame, ModelInstanceIndex, PdControllerGains, RigidBody
 from pydrake.systems.framework import Context, DiagramBuilder
 
 from drake_clutter.cell.fixture import Fixture
@@ -23,6 +23,15 @@ from drake_clutter.robots.model_parsing import parse_model
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.robots.robot_plant import PEDESTAL_NAME, add_robot, filter_collisions
 from drake_clutter.simulation.scene_plant import FRICTION, rigid_contact_properties
+
+JOINT_STIFFNESS = 1e5
+"""Proportional gain of the joint position control [N m/rad]: stiff, as that of industrial arms."""
+JOINT_DAMPING = 2e3
+"""Derivative gain of the joint position control [N m s/rad]."""
+JAW_STIFFNESS = 4e4
+"""Proportional gain of the position control of jaws [N/m]."""
+JAW_DAMPING = 200.0
+"""Derivative gain of the position control of jaws [N s/m]."""
 
 
 @dataclass(frozen=True)
@@ -106,6 +115,18 @@ def add_work_cell(
         name: plant.GetFrameByName(tool.frame, gripper) for name, tool in cell.gripper.tools.items()
     }
     return Arm(robot, gripper, model.joint_names, bodies, tuple(fixed), flange, tools)
+
+
+def set_position_gains(plant: MultibodyPlant, arm: Arm) -> None:
+    """Give the actuators of arm and jaws position control, before the plant is finalized."""
+    gains = {
+        arm.robot: PdControllerGains(p=JOINT_STIFFNESS, d=JOINT_DAMPING),
+        arm.gripper: PdControllerGains(p=JAW_STIFFNESS, d=JAW_DAMPING),
+    }
+    for index in plant.GetJointActuatorIndices():
+        actuator = plant.get_joint_actuator(index)
+        if actuator.model_instance() in gains:
+            actuator.set_controller_gains(gains[actuator.model_instance()])
 
 
 def fixture_name(plant: MultibodyPlant, body: RigidBody) -> str:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains, RigidBody
+from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
@@ -17,7 +17,12 @@ from drake_clutter.cell.suction import SuctionGripper
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.scenes.interfaces import ArmState
 from drake_clutter.scenes.scene import SceneObject
-from drake_clutter.simulation.cell_plant import Arm, add_work_cell, joint_state_indices
+from drake_clutter.simulation.cell_plant import (
+    Arm,
+    add_work_cell,
+    joint_state_indices,
+    set_position_gains,
+)
 from drake_clutter.simulation.scene_plant import (
     ScenePlant,
     add_fixed_objects,
@@ -34,15 +39,6 @@ from drake_clutter.station.grasp_constraint import (
 from drake_clutter.station.vacuum_system import VacuumSystem
 
 Floats = NDArray[np.float64]
-
-JOINT_STIFFNESS = 1e5
-"""Proportional gain of the joint position control [N m/rad]: stiff, as that of industrial arms."""
-JOINT_DAMPING = 2e3
-"""Derivative gain of the joint position control [N m s/rad]."""
-JAW_STIFFNESS = 4e4
-"""Proportional gain of the position control of jaws [N/m]."""
-JAW_DAMPING = 200.0
-"""Derivative gain of the position control of jaws [N s/m]."""
 
 
 class ClutterStation(Diagram):
@@ -137,8 +133,7 @@ class ClutterStation(Diagram):
         self.fixed_bodies = add_fixed_objects(plant, fixed_objects)
         graph = self.scene_plant.scene_graph
         self.arm = add_work_cell(plant, graph, cell, compliant=True, visuals=False)
-        _set_position_gains(plant, self.arm.robot, JOINT_STIFFNESS, JOINT_DAMPING)
-        _set_position_gains(plant, self.arm.gripper, JAW_STIFFNESS, JAW_DAMPING)
+        set_position_gains(plant, self.arm)
         self.grasp = _make_grasp_constraint(plant, self.arm, cell, self.scene_plant.bodies, weld)
         plant.Finalize()
         self.free_joints = {
@@ -311,16 +306,6 @@ class ClutterStation(Diagram):
             pair = results.point_pair_contact_info(i)
             bodies += [int(pair.bodyA_index()), int(pair.bodyB_index())]
         return {self._object_names[body] for body in bodies if body in self._object_names}
-
-
-def _set_position_gains(
-    plant: MultibodyPlant, instance: ModelInstanceIndex, stiffness: float, damping: float
-) -> None:
-    """Set the position control gains of the actuators of a model."""
-    for index in plant.GetJointActuatorIndices():
-        actuator = plant.get_joint_actuator(index)
-        if actuator.model_instance() == instance:
-            actuator.set_controller_gains(PdControllerGains(p=stiffness, d=damping))
 
 
 def _make_grasp_constraint(
