@@ -137,7 +137,10 @@ def rng(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-OPTIONAL = ("torch", "safetensors", "tensorboard", "threadpoolctl", "ray", "pybullet")
+OPTIONAL = (
+    *("torch", "safetensors", "tensorboard", "threadpoolctl", "ray", "pybullet"),
+    *("av", "foxglove_schemas_protobuf", "lerobot", "mcap", "mcap_protobuf", "pyarrow", "rerun"),
+)
 """Optional packages; tests that need a missing one are skipped."""
 _MISSING = "|".join(name for name in OPTIONAL if importlib.util.find_spec(name) is None)
 

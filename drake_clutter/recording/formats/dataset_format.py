@@ -1,0 +1,82 @@
+"""Formats of a data set, and what they need.
+
+Each is written from recorded episodes below the folder of the data set:
+
+    hdf5       episodes/episode_000000.h5, the recorded episodes themselves
+    lerobot    meta, data and videos: the folder is the root of a LeRobotDataset
+    robomimic  robomimic.hdf5
+    rerun      rerun/episode_000000.rrd
+    mcap       mcap/episode_000000.mcap
+"""
+
+import importlib.util
+from collections.abc import Iterable
+from enum import Enum
+from pathlib import Path
+
+from drake_clutter.files import InputError
+from drake_clutter.recording.recorded_episode import RecordedEpisode
+
+
+class DatasetFormat(Enum):
+    """Formats of a data set."""
+
+    HDF5 = "hdf5"
+    LEROBOT = "lerobot"
+    ROBOMIMIC = "robomimic"
+    RERUN = "rerun"
+    MCAP = "mcap"
+
+
+_MODULES = {
+    DatasetFormat.HDF5: {},
+    DatasetFormat.LEROBOT: {"pyarrow": "pyarrow", "av": "av"},
+    DatasetFormat.ROBOMIMIC: {},
+    DatasetFormat.RERUN: {"rerun": "rerun-sdk"},
+    DatasetFormat.MCAP: {
+        "mcap": "mcap",
+        "mcap_protobuf": "mcap-protobuf-support",
+        "foxglove_schemas_protobuf": "foxglove-schemas-protobuf",
+    },
+}
+"""Package of each module that a format needs, by the module."""
+
+
+def check_format(format: DatasetFormat) -> None:
+    """Check that the packages of a format are installed.
+
+    Raises:
+        InputError: One is missing.
+    """
+    missing = [
+        package
+        for module, package in _MODULES[format].items()
+        if importlib.util.find_spec(module) is None
+    ]
+    if missing:
+        raise InputError(
+            f"--format {format.value}: needs {', '.join(missing)}; "
+            "install drake_clutter with [data]"
+        )
+
+
+def convert_episodes(format: DatasetFormat, episodes: Iterable[RecordedEpisode], out: Path) -> None:
+    """Write episodes in a format; the recorded episodes themselves are HDF5 already.
+
+    Args:
+        format: The format.
+        episodes: Recorded episodes, which are read one after the other.
+        out: Folder of the data set.
+
+    Raises:
+        InputError: A package is missing, or the episodes do not suit the format.
+    """
+    check_format(format)
+    if format is DatasetFormat.LEROBOT:
+        from drake_clutter.recording.formats.lerobot import write_lerobot
+
+        write_lerobot(out, episodes)
+    elif format is DatasetFormat.ROBOMIMIC:
+        from drake_clutter.recording.formats.robomimic import write_robomimic
+
+        write_robomimic(out / "robomimic.hdf5", episodes)
