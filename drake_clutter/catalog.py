@@ -14,20 +14,21 @@ from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 from xml.etree import ElementTree
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from drake_clutter.built_mesh import read_mesh_measures, read_surface
 from drake_clutter.files import InputError, format_value, input_error, reading_file
-from drake_clutter.mesh_file import load_object_mesh
 from drake_clutter.resources import resource_path
 from drake_clutter.validation import InRange, NonEmptyText, StrictModel, allowed_error, validate
 from drake_clutter.yaml_io import read_yaml
+
+if TYPE_CHECKING:
+    import trimesh
 
 CATALOG_FILE = "catalog.yaml"
 _EARLIER_CATALOG_FILE = "catalogue.yaml"
@@ -313,9 +314,7 @@ class ObjectClass:
             if surface is not None:
                 return surface
         where = f"{catalog_path(self.folder.parent)}: classes.{self.name}.mesh"
-        return np.asarray(
-            load_object_mesh(self.mesh, where, self.mesh_unit.scale).solid.triangles, float
-        )
+        return np.asarray(_load_solid(self.mesh, where, self.mesh_unit).triangles, float)
 
     @cached_property
     def corners(self) -> NDArray[np.float64]:
@@ -352,11 +351,21 @@ class Catalog:
 
 def _read_piece(path: Path, remedy: str) -> NDArray[np.float64]:
     """Return the corners of a convex piece of a built class [m]. Shape (V, 3)."""
+    import trimesh  # imported late: it takes long, and boxes and cylinders need no meshes
+
     with reading_file(path, f"a convex piece; {remedy}"):
         corners = np.asarray(trimesh.load_mesh(path).vertices, float)
         if len(corners) < 4 or corners.shape[1] != 3 or not np.isfinite(corners).all():
             raise ValueError("it has no solid, or corners that are not finite")
         return corners
+
+
+def _load_solid(mesh: Path, where: str, unit: MeshUnit) -> "trimesh.Trimesh":
+    """Return the solid of a mesh file, see `load_object_mesh`."""
+    # Imported late: it takes long, and boxes and cylinders need no meshes.
+    from drake_clutter.mesh_file import load_object_mesh
+
+    return load_object_mesh(mesh, where, unit.scale).solid
 
 
 def _make_object_class(name: str, entry: ClassEntry, folder: Path, where: str) -> ObjectClass:
@@ -367,8 +376,7 @@ def _make_object_class(name: str, entry: ClassEntry, folder: Path, where: str) -
         if measures is not None:
             size = measures.extents
         else:
-            solid = load_object_mesh(mesh, f"{where}.mesh", entry.mesh_unit.scale).solid
-            extents = solid.extents
+            extents = _load_solid(mesh, f"{where}.mesh", entry.mesh_unit).extents
             size = (float(extents[0]), float(extents[1]), float(extents[2]))
     else:
         assert entry.size_mm is not None

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.optimize import brentq
-from scipy.stats import binomtest
 
 CONFIDENCE_LEVEL = 0.95
 """Probability that an interval contains the true value."""
@@ -25,6 +24,8 @@ def wilson_interval(successes: int, count: int) -> tuple[float, float]:
     """
     if count == 0:
         return 0.0, 1.0
+    from scipy.stats import binomtest  # imported late: it takes long
+
     interval = binomtest(successes, count).proportion_ci(CONFIDENCE_LEVEL, method="wilson")
     return float(interval.low), float(interval.high)
 

@@ -372,7 +372,7 @@ def test_images_and_recordings_show_the_arm(plan: PickPlacePlan, tmp_path: Path)
     assert moments[0].poses["sugar_box"].p == pytest.approx(SCENE["sugar_box"].X_TO.p, abs=0.01)
     assert moments[1].poses["sugar_box"].p[2] > 0.1
     assert moments[2].poses["sugar_box"].p[:2] == pytest.approx(PLACE.p[:2], abs=0.005)
-    picture = render_filmstrip(SCENE, moments, DEFAULT_CELL)
+    picture = render_filmstrip(SCENE, moments, DEFAULT_CELL, 480)
     assert picture.shape == (480, 4 * 480, 3)
     quarters = np.split(picture.astype(int), 4, axis=1)
     assert all(np.abs(a - b).mean() > 1 for a, b in itertools.pairwise(quarters)), "the arm moves"

@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from conftest import DEFAULT_CELL, ONE_CUP, cell_with, resting, rng, scene_of
@@ -465,7 +464,6 @@ def test_all_moves_are_in_the_plot_over_the_support() -> None:
     (panel, _) = figure.axes
     assert sorted(text.get_text() for text in panel.texts) == ["1", "1"]
     assert panel.images[0].get_extent() == pytest.approx([-0.15, 0.15, -0.5, 0.5])
-    plt.close(figure)
 
 
 def test_another_base_keeps_the_roll_and_pitch_of_the_cell() -> None:

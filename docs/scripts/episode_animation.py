@@ -29,7 +29,7 @@ def main(trajectory: Path, animation: Path) -> None:
     """Write a GIF of all moves of a recording."""
     scene, cell, moves = read_trajectories(trajectory, load_catalog())
     samples = [s for _, motion in moves for s in (*motion[::STRIDE], motion[-1])]
-    strip = render_filmstrip(scene, samples, cell)
+    strip = render_filmstrip(scene, samples, cell, 480)
     size = strip.shape[0]
     pictures = [
         Image.fromarray(strip[:, k * size : (k + 1) * size]).crop(CROP) for k in range(len(samples))

@@ -1,6 +1,8 @@
-"""Builder of SDF models, collision pieces and textured visuals of object classes."""
+"""Builder of SDF models, collision pieces and textured visuals of object classes.
 
-from drake_clutter.assets.asset_builder import build_assets, build_class, describe_built_mesh
-from drake_clutter.assets.textures import MOTIFS
+The names are imported when they are first used: cells and plants need the contact properties alone.
+"""
 
-__all__ = ["MOTIFS", "build_assets", "build_class", "describe_built_mesh"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

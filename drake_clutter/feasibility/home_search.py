@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.work_cell import WorkCell
@@ -146,6 +145,8 @@ class HomeSearch:
         lower, upper = robot.position_limits.T
         # A turn is enough where a joint can make several.
         middle, half = (lower + upper) / 2, np.minimum((upper - lower) / 2, math.pi)
+        from scipy.stats import qmc  # imported late: it takes long
+
         unit = qmc.Sobol(robot.num_joints, rng=0).random(NUM_SAMPLES)
         q = middle + (half - LIMIT_MARGIN) * (2 * unit - 1)
         rest = np.zeros_like(q)

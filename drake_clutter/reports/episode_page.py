@@ -53,6 +53,8 @@ _LABELS = {
 """Labels of the key figures, by key of the summary."""
 _KEY_FRAMES = ("Before the lift", "Carry", "Place", "Retreat")
 """Captions of the images of the arm, one for each of `select_key_frames`."""
+_FRAME_SIDE = 480
+"""Side of the images of the arm [px]."""
 _RECORDING_NOTES = {
     "arm": "The motion of the arm and of all objects is simulated.",
     "settle": "Lifting and carrying are an illustration, because objects are teleported; how they "
@@ -304,7 +306,8 @@ def _arm_figures(
             f"{caption}, {frame.time:.1f} s after the start.",
         )
         for index, (caption, frame, image) in enumerate(
-            zip(_KEY_FRAMES, frames, render_frames(scene, frames, cell), strict=True), start=1
+            zip(_KEY_FRAMES, frames, render_frames(scene, frames, cell, _FRAME_SIDE), strict=True),
+            start=1,
         )
     ]
     return f'<div class="key-frames">{"".join(figures)}</div>'

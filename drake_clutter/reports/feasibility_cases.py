@@ -26,6 +26,8 @@ Row = Mapping[str, Any]
 
 MAX_CASES_PER_SETUP = 3
 """Number of failures shown of each setup, each with another reason."""
+_FRAME_SIDE = 360
+"""Side of the pictures of the arm [px]."""
 
 
 def select_cases(moves: Sequence[Row]) -> list[tuple[str, Row]]:
@@ -91,7 +93,8 @@ def render_case(
         planner = PickPlacePlanner(cell.with_support(scene.support), PlannerConfig(optimize=False))
         plan = planner.plan(scene.objects, row["pick"], X_TO)
         if isinstance(plan, PickPlacePlan):
-            images.append(render_filmstrip(scene, _plan_key_frames(plan, scene, cell), cell))
+            frames = _plan_key_frames(plan, scene, cell)
+            images.append(render_filmstrip(scene, frames, cell, _FRAME_SIDE))
     return detail, [_encode_png(image) for image in images]
 
 
@@ -109,9 +112,9 @@ def _plan_key_frames(plan: PickPlacePlan, scene: Scene, cell: WorkCell) -> list[
 
 
 def _encode_png(image: NDArray[np.uint8]) -> bytes:
-    """Return an image as PNG, at most 1080 by 480 pixels."""
+    """Return an image as PNG, at most 480 pixels high."""
     stream = io.BytesIO()
     small = Image.fromarray(image)
-    small.thumbnail((1080, 480))
-    small.save(stream, format="PNG", optimize=True)
+    small.thumbnail((image.shape[1], 480))
+    small.save(stream, format="PNG")
     return stream.getvalue()

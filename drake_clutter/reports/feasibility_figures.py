@@ -1,13 +1,12 @@
-"""Figures of a feasibility study."""
+"""Figures of a feasibility study.
+
+They are made without `pyplot`, whose import takes long.
+"""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -36,7 +35,8 @@ def plot_ranking(summary: Row) -> Figure:
     """Plot the share of the possible moves of each setup with its interval, best first."""
     by_name = {setup["name"]: setup for setup in summary["setups"]}
     setups = [by_name[name] for name in summary["ranking"][:MAX_BARS]]
-    figure, axes = plt.subplots(figsize=(11, 1.2 + 0.42 * len(setups)))
+    figure = Figure(figsize=(11, 1.2 + 0.42 * len(setups)))
+    axes = figure.subplots()
     share = np.array([setup["share"] for setup in setups])
     low, high = np.array([setup["share_ci95"] for setup in setups]).T
     positions = np.arange(len(setups))
@@ -59,7 +59,8 @@ def plot_failures(moves: Rows, setups: Sequence[str]) -> Figure:
     failed = Counter(row["result"] for row in possible if row["result"] != PLANNED)
     reasons = [reason for reason, _ in failed.most_common()]
     size = 1.6 + 0.3 * len(reasons) * (1 + len(setups))
-    figure, axes = plt.subplots(figsize=(11, min(size, 12)))
+    figure = Figure(figsize=(11, min(size, 12)))
+    axes = figure.subplots()
     height = 0.8 / len(setups)
     for k, setup in enumerate(setups):
         rows = [row for row in possible if row["setup"] == setup]
@@ -130,7 +131,8 @@ def _height_interval(row: Mapping[str, Any]) -> str:
 def plot_by_object(moves: Rows, setups: Sequence[str]) -> Figure:
     """Plot the share of the possible moves by class, resting pose and height of the object."""
     moves = [row for row in moves if row["possible"]]
-    figure, axes = plt.subplots(1, 3, figsize=(15, 5.2), sharey=True, width_ratios=(2, 1, 1.3))
+    figure = Figure(figsize=(15, 5.2))
+    axes = figure.subplots(1, 3, sharey=True, width_ratios=(2, 1, 1.3))
     _plot_planned_fractions(
         axes[0], moves, setups, lambda row: str(row["object_class"]).replace("_", " "), "class"
     )
@@ -212,9 +214,8 @@ def _panels(count: int, width: float, height: float) -> tuple[Figure, list[Any]]
     """Return a figure with a number of panels, at most three in a row."""
     num_columns = min(3, count)
     num_rows = -(-count // num_columns)
-    figure, axes = plt.subplots(
-        num_rows, num_columns, figsize=(width * num_columns, height * num_rows), squeeze=False
-    )
+    figure = Figure(figsize=(width * num_columns, height * num_rows))
+    axes = figure.subplots(num_rows, num_columns, squeeze=False)
     for unused in axes.ravel()[count:]:
         unused.set_axis_off()
     return figure, [*axes.ravel()[:count]]
@@ -228,14 +229,8 @@ def plot_reachability(maps: Mapping[str, Row], names: Sequence[str]) -> Figure:
         names: Setups to show, each in a row.
     """
     tilts = maps[names[0]]["tilts_deg"]
-    figure, axes = plt.subplots(
-        len(names),
-        len(tilts),
-        figsize=(3.2 * len(tilts), 2.9 * len(names)),
-        squeeze=False,
-        sharex=True,
-        sharey=True,
-    )
+    figure = Figure(figsize=(3.2 * len(tilts), 2.9 * len(names)))
+    axes = figure.subplots(len(names), len(tilts), squeeze=False, sharex=True, sharey=True)
     for row, name in zip(axes, names, strict=True):
         found = maps[name]
         ends = [v[-1] + (v[1] - v[0]) / 2 for v in (found["x"], found["y"])]
@@ -303,7 +298,8 @@ def plot_noise(summary: Row) -> Figure:
         "calibration": ("camera calibration", "position [mm], yaw 0.1 deg/mm", 1000),
         "mass": ("mass of the object", "mass [%]", 100),
     }
-    figure, axes = plt.subplots(1, len(titles), figsize=(14, 4.6), sharey=True)
+    figure = Figure(figsize=(14, 4.6))
+    axes = figure.subplots(1, len(titles), sharey=True)
     for panel, (kind, (title, label, scale)) in zip(axes, titles.items(), strict=True):
         for setup in summary["setups"]:
             rows = [row for row in setup["noise"] if row["kind"] == kind]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-import matplotlib.pyplot as plt
+from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from drake_clutter.cell.work_cell import WorkCell
@@ -85,7 +85,7 @@ def write_feasibility_report(
         results: Results of the study.
         load_scene: Returns the scene of a name at its settled poses.
     """
-    with plt.rc_context(PLOT_STYLE):
+    with rc_context(PLOT_STYLE):
         parts = [*_summary_parts(results), *_figure_parts(results)]
     parts += _case_parts(results, load_scene)
     page = (
@@ -238,6 +238,5 @@ def _embedded_image(png: bytes, alt: str) -> str:
 def _figure(title: str, figure: Figure) -> str:
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=90)
-    plt.close(figure)
     image = _embedded_image(stream.getvalue(), title)
     return f"<h2>{escape(title)}</h2><figure>{image}</figure>"

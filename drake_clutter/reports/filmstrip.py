@@ -22,7 +22,6 @@ from drake_clutter.scenes.scene import Scene
 from drake_clutter.simulation.cell_plant import add_work_cell, set_joint_angles
 from drake_clutter.simulation.scene_plant import add_scene_plant, rigid_transform
 
-_FRAME_SIZE = (480, 480)
 _OVERSAMPLING = 2
 _CAMERA_POSITION = (1.10, -1.90, 1.30)
 """Position of the camera in the tray frame, if the arm's base is at -x [m]."""
@@ -71,14 +70,14 @@ def rotation_to_base_side(cell: WorkCell) -> NDArray[np.float64]:
 
 
 def render_filmstrip(
-    scene: Scene, frames: Sequence[MotionSample], cell: WorkCell
+    scene: Scene, frames: Sequence[MotionSample], cell: WorkCell, side: int
 ) -> NDArray[np.uint8]:
-    """Return the images of n frames side by side; see `render_frames`. Shape (480, 480 n, 3)."""
-    return np.hstack(render_frames(scene, frames, cell))
+    """Return the images of n frames side by side; see `render_frames`. Shape (side, side n, 3)."""
+    return np.hstack(render_frames(scene, frames, cell, side))
 
 
 def render_frames(
-    scene: Scene, frames: Sequence[MotionSample], cell: WorkCell
+    scene: Scene, frames: Sequence[MotionSample], cell: WorkCell, side: int
 ) -> list[NDArray[np.uint8]]:
     """Return an image of the cell for each frame.
 
@@ -86,9 +85,10 @@ def render_frames(
         scene: The objects.
         frames: Frames with joint positions of the arm.
         cell: The work cell; its support is replaced by the scene's.
+        side: Side of an image [px].
 
     Returns:
-        RGB images. Shape (480, 480, 3) each.
+        RGB images. Shape (side, side, 3) each.
     """
     cell = cell.with_support(scene.support)
     builder = DiagramBuilder()
@@ -106,8 +106,8 @@ def render_frames(
     diagram = builder.Build()
     root_context = diagram.CreateDefaultContext()
     plant_context = plant.GetMyMutableContextFromRoot(root_context)
-    width, height = (_OVERSAMPLING * size for size in _FRAME_SIZE)
-    info = CameraInfo(width, height, np.radians(_FOV_Y_DEG))
+    num_pixels = _OVERSAMPLING * side
+    info = CameraInfo(num_pixels, num_pixels, np.radians(_FOV_Y_DEG))
     camera = ColorRenderCamera(
         RenderCameraCore(_RENDERER, info, ClippingRange(0.05, 20.0), RigidTransform()), False
     )
@@ -125,6 +125,6 @@ def render_frames(
         query = query_port.Eval(scene_plant.scene_graph.GetMyContextFromRoot(root_context))
         world_frame = query.inspector().world_frame_id()
         color = query.RenderColorImage(camera, world_frame, X_TC).data[:, :, :3]
-        image = Image.fromarray(color).resize(_FRAME_SIZE, Image.Resampling.LANCZOS)
+        image = Image.fromarray(color).resize((side, side), Image.Resampling.LANCZOS)
         images.append(np.asarray(image))
     return images

@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import trimesh
-
 from drake_clutter.files import InputError, atomic_write, file_sha256, private_temporary_folder
 
 
@@ -22,6 +20,8 @@ def convert_stl_to_obj(path: Path) -> Path:
     obj_path = private_temporary_folder("meshes") / name
     if obj_path.is_file():
         return obj_path
+    import trimesh  # imported late: it takes long, and few models need it
+
     try:
         mesh = trimesh.load_mesh(path, file_type="stl")
         is_empty = not len(mesh.faces)

@@ -12,7 +12,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label, maximum_filter, minimum_filter
-from trimesh.bounds import oriented_bounds_2D
 
 from drake_clutter.cell.camera import pixel_grid
 from drake_clutter.scenes.interfaces import Observation
@@ -79,6 +78,8 @@ class OccludedBox:
             points_T: Points, of which only x and y are used [m]. Shape (N, 2) or (N, 3).
             top: Height of the box [m].
         """
+        from trimesh.bounds import oriented_bounds_2D  # imported late: it takes long
+
         bounds = oriented_bounds_2D(points_T[:, :2])  # type: ignore[no-untyped-call]
         to_center, (length, width) = bounds
         x, y = np.linalg.inv(to_center)[:2, 2]
