@@ -44,11 +44,13 @@ from benchmarks.planning_worker import to_objects, to_pose
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.planning.collision_model import CollisionModel
 from drake_clutter.planning.cubic_spline import SPLINE_ORDER, CubicSpline, clamped_knots
+from drake_clutter.planning.load_deflection import LoadDeflection
 from drake_clutter.planning.motion_limits import LimitViolation, MotionLimits, scale_to_limits
 from drake_clutter.planning.motion_plan import CellState, HeldObject
 from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.planning.state_check import find_object
 from drake_clutter.planning.time_parameterization import (
     MAX_JOINT_STEP,
     bspline_path,
@@ -59,6 +61,7 @@ from drake_clutter.planning.time_parameterization import (
 from drake_clutter.planning.trajectory_optimization import INFLUENCE_DISTANCE
 from drake_clutter.records import partial_records
 from drake_clutter.robots.robot_model import RobotModel, load_robot
+from drake_clutter.simulation.scene_plant import rigid_transform
 from drake_clutter.validation import to_plain
 from training.results_file import collect_records
 from training.script import WorkersOption, run_script
@@ -204,8 +207,16 @@ class Peers:
         )
         path = sample_path(CubicSpline.from_trajectory(plan.segments[1].trajectory), 0.01)
         attach(model, held)
-        sag = CELL.gripper.sag(plan.tool, plan.payload.mass)
-        distance = self._config.min_distance + self._config.carry_clearance.of_load(sag)
+        X_TG = rigid_transform(plan.X_TO_pick) @ plan.X_OG
+        deflection = LoadDeflection.of(
+            CELL.gripper,
+            plan.tool,
+            find_object(plan.start.objects, plan.pick).object_class,
+            plan.X_OG.inverse(),
+            X_TG.GetAsMatrix4(),
+        )
+        clearance = self._config.carry_clearance.of_load(deflection.displacement)
+        distance = self._config.min_distance + clearance
         found = model.distances_along(path, distance + START_MARGIN)
         # The longest part that is clear of obstacles.
         near = np.array([-1, *np.unique(found.rows[~model.is_to_arm(found)]), len(path)])

@@ -1,13 +1,17 @@
 """Clearance of carried objects from what may stand below the pick and the place pose."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from conftest import DEFAULT_CELL, resting, scene_of
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from drake_clutter.cell.gripper import Grasp
+from drake_clutter.cell.suction import SuctionGripper
 from drake_clutter.grammar import Orientation
 from drake_clutter.planning.carry_clearance import (
     CarriedBox,
@@ -16,11 +20,14 @@ from drake_clutter.planning.carry_clearance import (
     columns_below,
     worst_slack,
 )
+from drake_clutter.planning.load_deflection import LoadDeflection
+from drake_clutter.planning.motion_plan import MotionPlan
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.scenes.scene import Pose, SceneObject
+from drake_clutter.simulation.scene_plant import rigid_transform
 from drake_clutter.station.station_simulation import StationSimulation
 
 DOWN = RollPitchYaw(np.pi, 0.0, 0.0).ToRotationMatrix()
@@ -166,8 +173,26 @@ def test_a_hidden_box_is_not_dragged_along(end: tuple[float, float]) -> None:
 
 
 def test_the_sag_follows_from_load_and_stiffness() -> None:
-    assert DEFAULT_CELL.gripper.sag("large", 0.5) == pytest.approx(0.5 * 9.81 / 2000.0)
-    assert DEFAULT_CELL.gripper.sag("large", 5.0) == pytest.approx(0.006), "the stroke"
+    gripper = DEFAULT_CELL.gripper
+    assert isinstance(gripper, SuctionGripper)
+
+    def deflected(mass: float, p_GCm: Sequence[float], down: Sequence[float]) -> RigidTransform:
+        return gripper.deflection("large", mass, np.array(p_GCm), np.array(down))
+
+    below, along = (0.0, 0.0, 0.03), (0.0, 0.0, 1.0)
+    for mass, sag in ((0.5, 0.5 * 9.81 / 2000.0), (5.0, 0.006)):  # the stroke
+        assert deflected(mass, below, along).IsNearlyEqualTo(RigidTransform([0, 0, sag]), 1e-12)
+    # A load beside the axis tilts about the hinge, 10 mm behind the lip.
+    offset, weight, stiffness = 0.02, 0.5 * 9.81, gripper.cup("large").hinge_stiffness
+    tilted = deflected(0.5, (offset, 0.0, 0.03), along)
+    assert tilted.rotation().ToAngleAxis().angle() == pytest.approx(offset * weight / stiffness)
+    assert (tilted @ np.array([0.1, 0.0, 0.0]))[2] > weight / 2000.0, "the loaded side is lower"
+    # A load that is held at a side hangs from the hinge, without stretching the bellows.
+    held = deflected(0.5, (0.0, 0.0, 0.03), (0.0, 1.0, 0.0))
+    assert held.rotation().ToAngleAxis().angle() == pytest.approx(0.04 * weight / stiffness)
+    assert (held @ np.array([0.0, 0.0, 0.06]))[1] == pytest.approx(
+        0.07 * math.sin(0.04 * weight / stiffness)
+    )
     errors = CarryClearance(tracking_error=0.002, height_uncertainty=0.007)
     assert errors.of_load(0.0025) == pytest.approx(0.0115)
 
@@ -179,3 +204,34 @@ def test_a_path_is_as_clear_as_its_worst_configuration() -> None:
     box = CarriedBox.along(BOX.object_class, GRASP, X_TG)
     assert worst_slack((column,), box, 0.015, 0.001) == pytest.approx(0.0, abs=2e-4)
     assert worst_slack((column,), box, 0.025, 0.001) == pytest.approx(-0.005, abs=2e-4)
+
+
+def test_a_simulated_load_hangs_as_low_as_predicted() -> None:
+    """A sugar box that is held 20 mm beside its center tilts, its far corners sink by 5 mm."""
+    moved = resting("sugar_box")
+    planner = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(optimize=False))
+    down = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
+    X_TG = RigidTransform(down, [0.02, 0.0, moved.top_height])
+    X_OG = rigid_transform(moved.X_TO).inverse() @ X_TG
+    grasp = planner.make_grasp(moved, "large", X_OG)
+    assert isinstance(grasp, Grasp)
+    pick = planner.plan_pick(planner.home_state([moved]), moved.name, grasp=grasp)
+    assert isinstance(pick, MotionPlan)
+    simulation = StationSimulation(DEFAULT_CELL, scene_of(moved))
+    simulation.execute(pick)
+    X_TO = simulation.execute(planner.plan_hold(pick.end, 0.3)).poses[moved.name]
+    planned, held = pick.end.objects[0], pick.end.held
+    assert held is not None
+    deflection = LoadDeflection.of(
+        DEFAULT_CELL.gripper,
+        held.tool,
+        moved.object_class,
+        held.X_OG.inverse(),
+        (rigid_transform(planned.X_TO) @ held.X_OG).GetAsMatrix4(),
+    )
+    drop = planned.bounds_T[0][2] - replace(moved, X_TO=X_TO).bounds_T[0][2]
+    assert drop > 0.0045
+    assert deflection.drop == pytest.approx(drop, abs=0.0004)
+    displaced = X_TO.apply(moved.object_class.corners) - planned.corners_T
+    largest = float(np.linalg.norm(displaced, axis=1).max())
+    assert deflection.displacement == pytest.approx(largest, abs=0.0004)

@@ -24,6 +24,7 @@ CASES = {
     "10_own_objects": [],
     "11_compose_motions": [],
     "12_own_trajectory": [],
+    "13_pick_from_shelf": [],
 }
 """Options for a short run of each script."""
 HAS_MASKABLE_PPO = importlib.util.find_spec("sb3_contrib") is not None

@@ -62,11 +62,13 @@ def test_faces_beyond_the_stroke_are_refused() -> None:
 def test_two_pads_bear_twice_the_friction() -> None:
     zero = np.zeros(3)
     capacity = 2 * GRIPPER.friction * GRIPPER.force
-    assert GRIPPER.load_ratio(np.array([0.0, 0.0, capacity]), zero) == pytest.approx(1.0)
-    assert GRIPPER.load_ratio(np.array([0.6, 0.0, 0.8]) * capacity, zero) == pytest.approx(1.0)
-    assert GRIPPER.load_ratio(np.array([0.0, GRIPPER.force, 0.0]), zero) == pytest.approx(1.0)
+    assert GRIPPER.load_ratio(JAWS, np.array([0.0, 0.0, capacity]), zero) == pytest.approx(1.0)
+    assert GRIPPER.load_ratio(JAWS, np.array([0.6, 0.0, 0.8]) * capacity, zero) == pytest.approx(
+        1.0
+    )
+    assert GRIPPER.load_ratio(JAWS, np.array([0.0, GRIPPER.force, 0.0]), zero) == pytest.approx(1.0)
     torsion = np.array([0.0, capacity * 2 / 3 * 0.011, 0.0])
-    assert GRIPPER.load_ratio(zero, torsion) == pytest.approx(1.0)
+    assert GRIPPER.load_ratio(JAWS, zero, torsion) == pytest.approx(1.0)
 
 
 def test_jaws_keep_clear_of_neighbors(cell: WorkCell) -> None:

@@ -142,6 +142,10 @@ class GraspFailure:
     value: float
 
 
+UP = (0.0, 0.0, 1.0)
+"""Outward normal of a level surface, in T. Shape (3,)."""
+
+
 @dataclass(frozen=True)
 class GraspSampling:
     """Parameters of grasp sampling.
@@ -151,12 +155,15 @@ class GraspSampling:
         lip_gap: Gap between gripper and object when the gripper is switched on [m].
         max_grasps: Largest number of grasps of a tool.
         min_payload_acceleration: A grasp must hold the object at this acceleration [m/s^2].
+        normal: Direction in T from which the object is seen; surfaces whose normal differs by at
+            most 45 deg are grasped. Shape (3,).
     """
 
     spacing: float
     lip_gap: float
     max_grasps: int
     min_payload_acceleration: float
+    normal: tuple[float, float, float] = UP
 
 
 class Gripper(Protocol):
@@ -169,6 +176,10 @@ class Gripper(Protocol):
     @property
     def description(self) -> str:
         """Kind and sizes in a few words, for reports."""
+
+    @property
+    def safety(self) -> float:
+        """Safety factor of the load capacity in planning."""
 
     @property
     def mass(self) -> float:
@@ -241,12 +252,26 @@ class Gripper(Protocol):
             down_G: Direction of gravity in G, a unit vector. Shape (3,).
         """
 
-    def sag(self, tool: str, mass: float) -> float:
-        """Return the distance by which a load at rest hangs below its place in the rigid model [m].
+    def load_ratio(self, tool: str, force: Floats, moment: Floats) -> Floats:
+        """Return the ratio of a load to the load capacity of a tool, which fails above 1.
+
+        Args:
+            tool: Name of the tool.
+            force: Force of the object on the tool, in G [N]. Shape (..., 3).
+            moment: Moment of the object about G, in G [N m]. Shape (..., 3).
+
+        Returns:
+            Ratios. Shape (...).
+        """
+
+    def deflection(self, tool: str, mass: float, p_GCm: Floats, down_G: Floats) -> RigidTransform:
+        """Return the pose of a tool with a load at rest in the pose G that the rigid model has.
 
         Args:
             tool: Name of the tool.
             mass: Mass of the load [kg].
+            p_GCm: Center of mass of the load [m]. Shape (3,).
+            down_G: Direction of gravity in G, a unit vector. Shape (3,).
         """
 
     def can_attach(self, tool: str, object_class: ObjectClass, X_OG: RigidTransform) -> bool:

@@ -26,8 +26,10 @@ _NUM_LIP_POINTS = 24
 _RAY_STANDOFF = 0.05
 """Distance above the lip at which rays to the surface start [m], so that edges that rise above
 the lip are seen."""
-_DOWNWARD_ROTATION = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
-"""R_TG of a cup that points down."""
+_FACING_ROTATION = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
+"""R_NG of a cup that points away from a viewer N; R_TG of one that points down."""
+_MIN_HORIZONTAL_PART = 1e-6
+"""Smallest horizontal part of a unit vector that is not vertical."""
 
 
 def _grid_points(lower: Floats, upper: Floats, target: Floats, spacing: float) -> Floats:
@@ -188,25 +190,34 @@ def profile_deviation(profile: Floats, diameter: float) -> float:
     return float(np.ptp(profile - _ring_points(diameter)[:, :2] @ _slope(profile, diameter)))
 
 
-def top_poses(
-    object_class: ObjectClass, X_TO: RigidTransform, diameter: float, spacing: float
+def face_poses(
+    object_class: ObjectClass,
+    X_TO: RigidTransform,
+    normal: Floats,
+    diameter: float,
+    spacing: float,
 ) -> Iterator[RigidTransform]:
-    """Yield poses of a cup that touches the top of an object, closest to the center of mass first.
+    """Yield poses of a cup on the surface seen from a side, closest to the center of mass first.
 
-    The cup points down where the surface is nearly level, and along the surface's normal elsewhere.
+    The cup points against the viewing direction where the surface is nearly perpendicular to it,
+    and along the surface's normal elsewhere. Surfaces that face down are left out.
 
     Args:
         object_class: Class of the object.
         X_TO: Pose of the object.
+        normal: Direction from the object to the viewer, in T; up, to see it from above. Shape (3,).
         diameter: Diameter of the lip [m].
-        spacing: Distance of neighboring points seen from above [m].
+        spacing: Distance of neighboring points as they are seen [m].
     """
-    corners_T = object_class.corners @ np.ascontiguousarray(X_TO.rotation().matrix()).T
-    corners_T = corners_T + X_TO.translation()
-    lower, upper = corners_T.min(axis=0), corners_T.max(axis=0)
-    p_TCm = X_TO @ object_class.center_of_mass
-    for x, y in _grid_points(lower[:2], upper[:2], p_TCm[:2], spacing):
-        X_TG = RigidTransform(_DOWNWARD_ROTATION, [x, y, upper[2]])
+    R_TN = _viewer_rotation(normal)
+    R_NO = R_TN.inverse() @ X_TO.rotation()
+    corners_N = object_class.corners @ np.ascontiguousarray(R_NO.matrix()).T
+    corners_N = corners_N + R_TN.inverse() @ X_TO.translation()
+    lower, upper = corners_N.min(axis=0), corners_N.max(axis=0)
+    p_NCm = R_TN.inverse() @ (X_TO @ object_class.center_of_mass)
+    for x, y in _grid_points(lower[:2], upper[:2], p_NCm[:2], spacing):
+        p_NG = np.array([x, y, upper[2]])
+        X_TG = RigidTransform(R_TN @ _FACING_ROTATION, R_TN @ p_NG)
         X_OG = X_TO.InvertAndCompose(X_TG)
         profile = lip_surface_profile(object_class, X_OG, diameter)
         if np.isfinite(profile).all():
@@ -216,11 +227,24 @@ def top_poses(
             if tilt > _LEVEL_TILT:
                 X_TG = X_TG @ _turn_to_slope(_slope(profile, diameter), float(profile.mean()))
                 X_OG = X_TO.InvertAndCompose(X_TG)
+                if X_TG.rotation().matrix()[2, 2] > math.sin(_LEVEL_TILT):
+                    continue
             # The lip goes on until it touches a convex piece; those of a mesh may bulge.
             depth = _contact_depth(object_class, X_OG, diameter)
             if math.isfinite(depth):
                 X_TG = X_TG @ RigidTransform([0.0, 0.0, depth])
         yield X_TG
+
+
+def _viewer_rotation(normal: Floats) -> RotationMatrix:
+    """Return R_TN of the frame of a viewer: z towards it, y up unless it is above."""
+    up = np.array([0.0, 0.0, 1.0])
+    x = np.cross(up, normal)
+    length = float(np.linalg.norm(x))
+    if length < _MIN_HORIZONTAL_PART:
+        return RotationMatrix()
+    x /= length
+    return RotationMatrix(np.column_stack([x, np.cross(normal, x), normal]))
 
 
 def _turn_to_slope(slope: Floats, depth: float) -> RigidTransform:

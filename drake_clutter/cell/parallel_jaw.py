@@ -11,6 +11,7 @@ arcs of 14 mm height; size of pads, jaws and palm; friction of the pads.
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Annotated, Literal
 
 import numpy as np
@@ -20,6 +21,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from drake_clutter.assets.contact_properties import SURFACE_FRICTION
 from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.cell.gripper import (
+    UP,
     Grasp,
     GraspFailure,
     GraspFailureReason,
@@ -107,10 +109,12 @@ class ParallelJawGripper(StrictModel):
         """Return grasps on two opposed faces from above, see `Gripper`.
 
         Boxes are grasped on two vertical faces, upright cylinders in several directions, lying ones
-        across. Meshes are not grasped.
+        across. Meshes are not grasped, and no object is from its sides.
         """
         corners_T = object_class.corners @ np.ascontiguousarray(X_TO.rotation().matrix()).T
         corners_T = corners_T + X_TO.translation()
+        if sampling.normal != UP:
+            return GraspFailure(GraspFailureReason.NO_OPPOSED_FACES, math.inf)
         bottom, top = float(corners_T[:, 2].min()), float(corners_T[:, 2].max())
         height = self._pad_height(bottom, top)
         if height is None:
@@ -213,13 +217,15 @@ class ParallelJawGripper(StrictModel):
 
     def max_acceleration(self, tool: str, mass: float, p_GCm: Floats, down_G: Floats) -> float:
         """Return the largest acceleration of a load, see `Gripper`."""
-        return max_payload_acceleration(mass, p_GCm, down_G, self.load_ratio, 1 / self.safety)
+        return max_payload_acceleration(
+            mass, p_GCm, down_G, partial(self.load_ratio, tool), 1 / self.safety
+        )
 
-    def sag(self, tool: str, mass: float) -> float:
-        """Return 0: the jaws are rigid."""
-        return 0.0
+    def deflection(self, tool: str, mass: float, p_GCm: Floats, down_G: Floats) -> RigidTransform:
+        """Return the identity: the jaws are rigid."""
+        return RigidTransform()
 
-    def load_ratio(self, force: Floats, moment: Floats) -> Floats:
+    def load_ratio(self, tool: str, force: Floats, moment: Floats) -> Floats:
         """Return the ratio of a load to the load capacity; the object slips above 1.
 
         The limit surface of each patch is an ellipsoid (Howe and Cutkosky 1996, "Practical
@@ -228,6 +234,7 @@ class ParallelJawGripper(StrictModel):
         which is neglected.
 
         Args:
+            tool: Name of the tool.
             force: Force of the object on the gripper, in G [N]. Shape (..., 3).
             moment: Moment of the object about G, in G [N m]. Shape (..., 3).
 

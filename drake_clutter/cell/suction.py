@@ -19,7 +19,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
+from scipy.spatial.transform import Rotation
 
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.epick import EPICK_LENGTH, epick_mass, epick_sdf
@@ -33,10 +34,10 @@ from drake_clutter.cell.gripper import (
     Tool,
 )
 from drake_clutter.cell.lip_seal import (
+    face_poses,
     lip_surface_profile,
     profile_deviation,
     profile_tilt,
-    top_poses,
 )
 from drake_clutter.cell.payload_limits import GRAVITY, max_payload_acceleration
 from drake_clutter.cell.suction_cup import SuctionCup
@@ -205,7 +206,7 @@ class SuctionGripper(StrictModel):
         X_TO: RigidTransform,
         sampling: GraspSampling,
     ) -> Sequence[Grasp] | GraspFailure:
-        """Return grasps on the top at which a lip seals and holds, see `Gripper`.
+        """Return grasps at which a lip seals and holds, see `Gripper`.
 
         Those of the first cup come first, and those of a cup in the order of their distances from
         the center of mass.
@@ -244,7 +245,8 @@ class SuctionGripper(StrictModel):
                 that seals is removed.
         """
         p_TCm = X_TO @ object_class.center_of_mass
-        for X_TG in top_poses(object_class, X_TO, cup.diameter, sampling.spacing):
+        normal = np.array(sampling.normal)
+        for X_TG in face_poses(object_class, X_TO, normal, cup.diameter, sampling.spacing):
             X_OG = X_TO.InvertAndCompose(X_TG)
             profile = lip_surface_profile(object_class, X_OG, cup.diameter) + sampling.lip_gap
             if not self._seals(profile, cup.diameter):
@@ -314,10 +316,15 @@ class SuctionGripper(StrictModel):
             mass, p_GCm, down_G, partial(self.load_ratio, tool), 1 / self.safety
         )
 
-    def sag(self, tool: str, mass: float) -> float:
-        """Return the extension of the bellows under a load, see `Gripper`."""
+    def deflection(self, tool: str, mass: float, p_GCm: Floats, down_G: Floats) -> RigidTransform:
+        """Return the extension and the tilt of the bellows under a load, see `Gripper`."""
         cup = self.cup(tool)
-        return min(mass * GRAVITY / cup.stiffness, cup.stroke)
+        force = mass * GRAVITY * down_G
+        extension = float(np.clip(force[2] / cup.stiffness, -cup.stroke, cup.stroke))
+        p_GHinge = np.array([0.0, 0.0, -cup.hinge_distance])
+        tilt = np.cross(p_GCm - p_GHinge, force) / cup.hinge_stiffness
+        rotation = RotationMatrix(Rotation.from_rotvec([tilt[0], tilt[1], 0.0]).as_matrix())
+        return RigidTransform(rotation, p_GHinge - rotation @ p_GHinge + [0.0, 0.0, extension])
 
     def load_ratio(
         self, tool: str, force: Floats, moment: Floats, vacuum: float | None = None

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from drake_clutter.catalog import ObjectClass
+from drake_clutter.planning.tool_kinematics import departure_axis
 from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.validation import NonNegative, config_class
 
@@ -33,7 +34,7 @@ _TOLERANCE = 1e-4
 class CarryClearance:
     """Errors for which a carried object keeps a distance in addition to `min_distance`.
 
-    The sag of the tool's bellows is added; it follows from the load.
+    The displacement by the tool's bellows is added; it follows from the load.
 
     Attributes:
         tracking_error: Largest distance of a moving object from where it would hang at rest on the
@@ -54,13 +55,23 @@ class CarryClearance:
     hidden_margin: NonNegative = 0.013
     max_drift: NonNegative = 0.001
 
-    def of_load(self, sag: float) -> float:
+    def of_load(self, displacement: float) -> float:
         """Return the additional distance of an object from obstacles [m].
 
         Args:
-            sag: Distance by which the object hangs lower than planned [m].
+            displacement: Largest displacement of a corner of the object at rest, as its weight
+                stretches and bends the bellows [m].
         """
-        return sag + self.tracking_error + max(self.position_uncertainty, self.height_uncertainty)
+        return (
+            displacement
+            + self.tracking_error
+            + max(self.position_uncertainty, self.height_uncertainty)
+        )
+
+
+def box_corners(object_class: ObjectClass) -> Floats:
+    """Return the corners of the bounding box of a class in O [m]. Shape (8, 3)."""
+    return np.asarray(_CORNER_SIGNS * np.asarray(object_class.size) / 2)
 
 
 @dataclass(frozen=True)
@@ -87,8 +98,7 @@ class CarriedBox:
             X_TG: Poses of the tool. Shape (m, 4, 4).
         """
         X_TO = X_TG @ X_OG.inverse().GetAsMatrix4()
-        p_OC = _CORNER_SIGNS * np.asarray(object_class.size) / 2
-        corners = p_OC @ X_TO[:, :3, :3].swapaxes(1, 2) + X_TO[:, None, :3, 3]
+        corners = box_corners(object_class) @ X_TO[:, :3, :3].swapaxes(1, 2) + X_TO[:, None, :3, 3]
         return CarriedBox(corners, X_TO[:, :2, :3].swapaxes(1, 2), X_TG[:, :3, 3])
 
 
@@ -119,7 +129,8 @@ class Column:
         axes: Axes of the base in T. Shape (2, 2).
         half_size: Half the extents along the axes [m]. Shape (2,).
         top: Height of the object's bottom [m].
-        anchors: Position of the tool and axis of the tool in T at each anchor. Shape (k, 2, 3).
+        anchors: Position of the tool in T, and direction in which the object leaves, at each
+            anchor. Shape (k, 2, 3).
     """
 
     center: Floats
@@ -149,7 +160,7 @@ class Column:
             axes=axes,
             half_size=(upper - lower) / 2,
             top=float(corners[:, 2].min()),
-            anchors=np.array([[X_TG[:3, 3], X_TG[:3, 2]]]),
+            anchors=np.array([[X_TG[:3, 3], departure_axis(X_TG)]]),
         )
 
     def fitted(self, margin: float, box: CarriedBox, anchor: Floats) -> "Column | None":
@@ -158,7 +169,7 @@ class Column:
         Args:
             margin: Distance by which what is below may project, if there is room for it [m].
             box: Box of the object at the other end, at one configuration.
-            anchor: Position and axis of the tool at the other end. Shape (2, 3).
+            anchor: Position and direction at the other end. Shape (2, 3).
 
         Returns:
             The column, or None if the object is placed where the column would be: what stands below

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from drake_clutter.cell.gripper import Payload
-from drake_clutter.planning.tool_kinematics import is_vertical
+from drake_clutter.planning.tool_kinematics import is_sideways, is_vertical
 
 Floats = NDArray[np.float64]
 
@@ -31,6 +31,8 @@ class GraspCandidate:
         joints_held: Positions of the gripper's joints with the object, see `Grasp` [m].
         q_pick: Joint positions at the grasp [rad]. Shape (n,).
         q_place: Joint positions at the place pose [rad]. Shape (n,).
+        load_distance: Distance that the held object keeps in addition to
+            `PlannerConfig.min_distance` [m].
     """
 
     tool: str
@@ -43,6 +45,12 @@ class GraspCandidate:
     joints_held: tuple[float, ...]
     q_pick: Floats
     q_place: Floats
+    load_distance: float
+
+    @property
+    def is_sideways(self) -> bool:
+        """Whether the tool grasps a side of the object, or releases it from a side."""
+        return is_sideways(self.X_TG_pick) or is_sideways(self.X_TG_place)
 
     @property
     def is_tilted(self) -> bool:
@@ -60,8 +68,10 @@ class EndpointContext:
         allowed_distances: Allowed distance of pairs at the endpoint [m]: between the attached
             object and each body that it touches there, and between the gripper and each body below
             a thin object, by names.
+        load_distance: See `GraspCandidate`.
     """
 
     tool: str
     p_TG_xy: Floats
     allowed_distances: Mapping[tuple[str, str], float]
+    load_distance: float

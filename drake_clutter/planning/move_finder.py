@@ -4,23 +4,26 @@ Frames: T is the support, G is a tool of the gripper, O is the picked object.
 """
 
 import time
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.trajectories import Trajectory
 
-from drake_clutter.cell.gripper import Grasp, GraspFailure, GraspSampling, Gripper
+from drake_clutter.cell.gripper import UP, Grasp, GraspFailure, GraspSampling, Gripper
 from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.files import InputError, format_value
 from drake_clutter.planning.collision_model import CollisionModel
 from drake_clutter.planning.motion_plan import CellState
 from drake_clutter.planning.pick_place_plan import PlanningFailure, PlanningFailureReason
 from drake_clutter.planning.pick_place_search import FoundMove, MoveGoal, PickPlaceSearch
 from drake_clutter.planning.place_check import check_place
 from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.planning.side_grasps import side_normals
 from drake_clutter.planning.state_check import (
     JOINT_TOLERANCE,
     check_configuration,
@@ -36,6 +39,10 @@ from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.scene_plant import rigid_transform
 
 Floats = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+GraspChoice = Grasp | Sequence[Grasp] | None
+"""Grasp of an object, several in the order in which they are tried, or None to sample grasps."""
 
 
 class MoveFinder:
@@ -90,22 +97,38 @@ class MoveFinder:
         self,
         state: CellState,
         goal: MoveGoal,
-        grasp: Grasp | None,
+        grasp: GraspChoice,
         occluded: Sequence[OccludedBox],
     ) -> tuple[FoundMove, int] | PlanningFailure:
-        """Return a motion that starts with an approach, and the number of attempts."""
+        """Return a motion that starts with an approach, and the number of attempts.
+
+        Sides of the object are grasped if there is no motion with a grasp from above.
+        """
         start_time = time.perf_counter()
         if carried := objects_resting_on(goal.picked, state.objects):
             return PlanningFailure(PlanningFailureReason.CARRIES_OTHERS, ", ".join(carried))
-        grasps = self._grasps(goal.picked) if grasp is None else (grasp,)
-        if isinstance(grasps, PlanningFailure):
-            return grasps
+        if grasp is None:
+            faces = self._graspable_faces(goal.picked)
+            first = next(faces, None)
+            if first is None:
+                return self._grasp_failure(goal.picked)
+            candidates: Iterable[Sequence[Grasp]] = chain([first], faces)
+        else:
+            candidates = [(grasp,) if isinstance(grasp, Grasp) else grasp]
         model = self.collision_model(state.objects, occluded)
-        if failure := self._check_endpoints(state, goal, model):
+        failure = self._check_endpoints(state, goal, model)
+        if failure is not None:
             return failure
         search = self._search(model, state, goal, occluded)
-        found = self._try_grasps(search, grasps, start_time)
-        return found if isinstance(found, PlanningFailure) else (found, search.num_attempts)
+        failure = search.failures.furthest
+        for grasps in candidates:
+            found = self._try_grasps(search, grasps, start_time)
+            if not isinstance(found, PlanningFailure):
+                return found, search.num_attempts
+            failure = found
+            if failure.reason is PlanningFailureReason.TIME_OUT:
+                break
+        return failure
 
     def _find_held(
         self, state: CellState, goal: MoveGoal, occluded: Sequence[OccludedBox]
@@ -134,9 +157,10 @@ class MoveFinder:
         self, search: PickPlaceSearch, grasps: Sequence[Grasp], start_time: float
     ) -> FoundMove | PlanningFailure:
         """Return the first motion that is found, or the failure of the best attempt."""
+        max_attempts = search.num_attempts + self.config.max_attempts
         for grasp in grasps:
             for candidate in search.ik_candidates(grasp):
-                if search.num_attempts >= self.config.max_attempts:
+                if search.num_attempts >= max_attempts:
                     return search.failures.furthest
                 if time.perf_counter() - start_time > self.config.time_limit:
                     return PlanningFailure(
@@ -230,17 +254,54 @@ class MoveFinder:
         tops = [*model.fixture_tops, *(box.top_height for box in occluded)]
         return PickPlaceSearch(self.cell, self.config, self.tools, model, state, goal, tops)
 
-    def grasps(self, scene_object: SceneObject) -> Sequence[Grasp] | PlanningFailure:
-        """Return the feasible grasps of an object, closest to its center of mass first."""
-        return self._grasps(scene_object)
+    def grasps(
+        self, scene_object: SceneObject, normal: Vector = UP
+    ) -> Sequence[Grasp] | PlanningFailure:
+        """Return the feasible grasps of an object, closest to its center of mass first.
 
-    def _find_grasps(self, picked: SceneObject) -> Sequence[Grasp] | PlanningFailure:
-        """Return the feasible grasps of an object, closest to its center of mass first."""
+        Args:
+            scene_object: The object at its pose.
+            normal: Direction from which it is grasped: surfaces whose outward normal differs by at
+                most 45 deg count. In T; a horizontal one for a side. Shape (3,).
+
+        Raises:
+            InputError: The normal is not a direction.
+        """
+        length = float(np.linalg.norm(normal))
+        if not 0 < length < np.inf:
+            raise InputError(f"normal: {format_value(list(normal))}; expected a direction")
+        x, y, z = (np.array(normal) / length).tolist()
+        return self._grasps(scene_object, (x, y, z))
+
+    def _faces(self, picked: SceneObject) -> tuple[Vector, ...]:
+        """Return the directions from which an object may be grasped; from above first."""
+        return UP, *side_normals(picked, self.robot.X_TB.translation())
+
+    def _graspable_faces(self, picked: SceneObject) -> Iterator[Sequence[Grasp]]:
+        """Yield the grasps of each face that has any, see `_faces`."""
+        for normal in self._faces(picked):
+            grasps = self._grasps(picked, normal)
+            if not isinstance(grasps, PlanningFailure):
+                yield grasps
+
+    def _grasp_failure(self, picked: SceneObject) -> PlanningFailure:
+        """Return why no face of an object has a grasp."""
+        found = (self._grasps(picked, normal) for normal in self._faces(picked))
+        from_above, *of_sides = (f for f in found if isinstance(f, PlanningFailure))
+        if from_above.reason is not PlanningFailureReason.NO_SEAL:
+            return from_above
+        # A side on which the gripper seals, but does not hold the object, is closer to a grasp.
+        return next((f for f in of_sides if f.reason is not from_above.reason), from_above)
+
+    def _find_grasps(
+        self, picked: SceneObject, normal: Vector
+    ) -> Sequence[Grasp] | PlanningFailure:
+        """Return the feasible grasps of an object, see `grasps`."""
         if failure := self._check_payload(picked):
             return failure
         object_class = picked.object_class
         grasps = self._gripper.sample_grasps(
-            object_class, rigid_transform(picked.X_TO), self._sampling
+            object_class, rigid_transform(picked.X_TO), replace(self._sampling, normal=normal)
         )
         if isinstance(grasps, GraspFailure):
             reason = PlanningFailureReason(grasps.reason.value)

@@ -21,7 +21,7 @@ from drake_clutter.planning.motion_plan import (
     PlanStep,
     stay_at,
 )
-from drake_clutter.planning.move_finder import MoveFinder
+from drake_clutter.planning.move_finder import GraspChoice, MoveFinder
 from drake_clutter.planning.pick_place_plan import (
     PickPlacePlan,
     PlanningFailure,
@@ -77,7 +77,7 @@ class PickPlacePlanner(MoveFinder):
         X_TO_place: Pose,
         occluded: Sequence[OccludedBox] = (),
         *,
-        grasp: Grasp | None = None,
+        grasp: GraspChoice = None,
         start: Sequence[float] | None = None,
         end: Sequence[float] | None = None,
     ) -> PickPlacePlan | PlanningFailure:
@@ -88,7 +88,8 @@ class PickPlacePlanner(MoveFinder):
             pick: Name of the picked object.
             X_TO_place: Pose at which the object is released.
             occluded: Occluded volumes, which count as obstacles.
-            grasp: Grasp of the object, see `make_grasp`; None to sample grasps.
+            grasp: Grasp of the object, see `make_grasp`, or several, see `grasps`; None to sample
+                grasps from above, then from its sides.
             start: Joint positions at the start [rad]; None for home. Shape (n,).
             end: Joint positions at the end [rad]; None for home. Shape (n,).
 
@@ -142,7 +143,7 @@ class PickPlacePlanner(MoveFinder):
         state: CellState,
         pick: str,
         *,
-        grasp: Grasp | None = None,
+        grasp: GraspChoice = None,
         lift_height: float | None = None,
         occluded: Sequence[OccludedBox] = (),
     ) -> MotionPlan | PlanningFailure:
@@ -151,7 +152,8 @@ class PickPlacePlanner(MoveFinder):
         Args:
             state: State at the start; no object is held.
             pick: Name of the object.
-            grasp: Grasp of the object, see `make_grasp`; None to sample grasps.
+            grasp: Grasp of the object, see `make_grasp`, or several, see `grasps`; None to sample
+                grasps from above, then from its sides.
             lift_height: Height by which it is lifted at least [m]; None for that of the
                 configuration.
             occluded: Occluded volumes, which count as obstacles.
@@ -312,7 +314,7 @@ class PickPlacePlanner(MoveFinder):
 
     def can_grasp(self, scene_object: SceneObject) -> bool:
         """Return whether the gripper has a grasp on an object that holds its weight."""
-        return not isinstance(self._grasps(scene_object), PlanningFailure)
+        return any(True for _ in self._graspable_faces(scene_object))
 
     def can_pick(self, scene_object: SceneObject, objects: Sequence[SceneObject]) -> bool:
         """Return whether an object can be grasped and no other object rests on it.
@@ -338,8 +340,7 @@ class PickPlacePlanner(MoveFinder):
             X_TO_place: Pose at which the object is released.
         """
         picked = find_object(objects, pick)
-        grasps = self._grasps(picked)
-        if objects_resting_on(picked, objects) or isinstance(grasps, PlanningFailure):
+        if objects_resting_on(picked, objects):
             return False
         model = self.collision_model(objects)
         max_drop = self.config.max_guarded_descent
@@ -347,7 +348,8 @@ class PickPlacePlanner(MoveFinder):
             return False
         goal = MoveGoal(picked, X_TO_place, self.config.lift_height, True, self.robot.home)
         search = self._search(model, self.home_state(objects), goal)
-        return any(search.has_candidate(grasp) for grasp in grasps)
+        faces = self._graspable_faces(picked)
+        return any(search.has_candidate(grasp) for grasps in faces for grasp in grasps)
 
     def _step(self, name: str, trajectory: Trajectory, held: HeldObject | None) -> PlanStep:
         """Return a step in which the gripper stays as it is."""

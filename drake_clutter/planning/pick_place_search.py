@@ -16,6 +16,7 @@ from drake_clutter.cell.support_sdf import FLOOR
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.collision_model import CollisionModel
 from drake_clutter.planning.grasp_candidate import EndpointContext, GraspCandidate
+from drake_clutter.planning.load_deflection import LoadDeflection
 from drake_clutter.planning.motion_plan import CellState, HeldObject
 from drake_clutter.planning.pick_place_plan import (
     FailureLog,
@@ -28,12 +29,18 @@ from drake_clutter.planning.segment_planner import (
     CONTACT_TOLERANCE,
     SegmentPlanner,
 )
+from drake_clutter.planning.side_grasps import distance_from_below
 from drake_clutter.planning.time_parameterization import min_travel_time
 from drake_clutter.planning.tool_kinematics import (
+    RISE_CORNER,
     CarryPath,
     ToolKinematics,
+    WayOut,
+    has_same_tilt,
     invert_pose,
+    is_sideways,
     is_vertical,
+    raise_pose,
     retreat_along_axis,
     turn_about_axis,
 )
@@ -146,6 +153,7 @@ class PickPlaceSearch:
         )
         placed = replace(picked, X_TO=X_TO_place)
         self._others = [o for o in state.objects if o.name != picked.name]
+        self._fixed_corners = collision_model.fixed_corners
         # Heights of the object's bottom: above its pick and place pose, or above a higher obstacle.
         self._place_bottom = placed.bounds_T[0][2]
         bottom = max(picked.bounds_T[0][2], self._place_bottom)
@@ -168,6 +176,15 @@ class PickPlaceSearch:
         else:
             X_pick = [self._gripper_pose_at_pick(grasp, yaw) for yaw in yaws]
         X_place = [self._gripper_pose_at_place(X) for X in X_pick]
+        # Deflection and load are the same at all angles about the axis of the tool.
+        X_GO = RigidTransform(invert_pose(X_pick[0]) @ self._X_TO)
+        of_load = [
+            LoadDeflection.of(self._cell.gripper, grasp.tool, self._picked.object_class, X_GO, X_TG)
+            for X_TG in (X_pick[0], X_place[0])
+        ]
+        if self._goal.releases and is_sideways(X_place[0]):
+            # It is released where the edge that hangs lowest touches what is below.
+            X_place = [raise_pose(X_TG, max(of_load[1].drop, 0.0)) for X_TG in X_place]
         q_pick, q_place = self._solve_endpoints(tool, np.array(X_pick), np.array(X_place))
         legs = [q_place - q_pick]
         if not self._is_held:
@@ -180,25 +197,26 @@ class PickPlaceSearch:
         num_candidates = np.isfinite(travel_time).sum()
         num_solutions = travel_time.shape[1]
         indices = [divmod(int(k), num_solutions) for k in order[:num_candidates]]
+        payload = self._payload(grasp, X_GO, X_pick[0], X_place[0])
+        if payload.max_acceleration < self._config.min_payload_acceleration:
+            mass = self._picked.object_class.mass
+            self.failures.record(0, PlanningFailureReason.TOO_HEAVY, "tilted", mass)
+            return
+        displacement = max(deflection.displacement for deflection in of_load)
         for k in indices:
             X_TG_pick, X_TG_place = X_pick[k[0]], X_place[k[0]]
-            X_OG = RigidTransform(invert_pose(self._X_TO) @ X_TG_pick)
-            payload = self._payload(grasp, X_OG, X_TG_pick, X_TG_place)
-            if payload.max_acceleration < self._config.min_payload_acceleration:
-                mass = self._picked.object_class.mass
-                self.failures.record(0, PlanningFailureReason.TOO_HEAVY, "tilted", mass)
-                continue
             yield GraspCandidate(
                 tool=grasp.tool,
                 payload=payload,
                 X_TG_pick=X_TG_pick,
                 X_TG_place=X_TG_place,
-                X_OG=X_OG,
+                X_OG=RigidTransform(invert_pose(self._X_TO) @ X_TG_pick),
                 insertion=grasp.insertion,
                 joints_open=grasp.joints_open,
                 joints_held=grasp.joints_held,
                 q_pick=q_pick[k],
                 q_place=q_place[k],
+                load_distance=self._config.carry_clearance.of_load(displacement),
             )
 
     def _solve_endpoints(
@@ -229,7 +247,7 @@ class PickPlaceSearch:
         return q_pick, self._robot.unwrap(q_place, q_pick)
 
     def _payload(
-        self, grasp: Grasp, X_OG: RigidTransform, X_TG_pick: Floats, X_TG_place: Floats
+        self, grasp: Grasp, X_GO: RigidTransform, X_TG_pick: Floats, X_TG_place: Floats
     ) -> Payload:
         """Return the load of a grasp, which the tool must hold at the tilts of both endpoints."""
         if is_vertical(X_TG_pick) and is_vertical(X_TG_place):
@@ -238,12 +256,27 @@ class PickPlaceSearch:
         halfway = downs[0] + downs[1]
         downs.append(halfway / np.linalg.norm(halfway))
         object_class = self._picked.object_class
-        p_GCm = X_OG.inverse() @ object_class.center_of_mass
+        p_GCm = X_GO @ object_class.center_of_mass
         acceleration = min(
             self._cell.gripper.max_acceleration(grasp.tool, object_class.mass, p_GCm, down_G)
             for down_G in downs
         )
         return replace(grasp.payload, max_acceleration=acceleration)
+
+    def _way_out(self, o: SceneObject, X_TG: Floats, load_distance: float) -> WayOut:
+        """Return the way out of a tool on a side of an object.
+
+        Args:
+            o: The object at its pose.
+            X_TG: Pose of the tool. Shape (4, 4).
+            load_distance: See `GraspCandidate`.
+        """
+        if not is_sideways(X_TG):
+            return WayOut()
+        obstacles = [*self._fixed_corners, *(other.corners_T for other in self._others)]
+        clearance = self._config.min_distance + load_distance
+        distance = distance_from_below(o.corners_T, -X_TG[:2, 2], obstacles, clearance)
+        return WayOut(clearance + RISE_CORNER, distance)
 
     def _gripper_pose_at_pick(self, grasp: Grasp, yaw: float) -> Floats:
         """Return X_TG at the grasp, `PlannerConfig.lip_gap` above the surface. Shape (4, 4)."""
@@ -260,11 +293,13 @@ class PickPlaceSearch:
         self._segments.set_up_segment("approach", candidate)
         below = self._bodies_below(self._picked)
         of_gripper = self._segments.distances_below_object(candidate, q, below)
-        context = EndpointContext(candidate.tool, candidate.X_TG_pick[:2, 3], of_gripper)
+        context = EndpointContext(
+            candidate.tool, candidate.X_TG_pick[:2, 3], of_gripper, candidate.load_distance
+        )
         if self._segments.min_distance_along(q[None], context, 1, "at the grasp") is None:
             return None
         self._segments.set_up_segment("carry", candidate)
-        of_object = self._segments.contact_distances(q)
+        of_object = self._segments.contact_distances(candidate, q)
         return replace(context, allowed_distances=of_gripper | of_object)
 
     def _place_endpoint(self, candidate: GraspCandidate, q: Floats) -> EndpointContext | None:
@@ -275,8 +310,14 @@ class PickPlaceSearch:
         self._segments.set_up_segment("carry", candidate)
         below = self._bodies_below(replace(self._picked, X_TO=self._X_TO_goal))
         of_gripper = self._segments.distances_below_object(candidate, q, below)
-        allowed = of_gripper | self._segments.contact_distances(q) if self._goal.releases else {}
-        context = EndpointContext(candidate.tool, candidate.X_TG_place[:2, 3], allowed)
+        allowed = (
+            of_gripper | self._segments.contact_distances(candidate, q)
+            if self._goal.releases
+            else {}
+        )
+        context = EndpointContext(
+            candidate.tool, candidate.X_TG_place[:2, 3], allowed, candidate.load_distance
+        )
         distance = self._segments.min_distance_along(q[None], context, 2, "at the place")
         return None if distance is None else context
 
@@ -315,7 +356,9 @@ class PickPlaceSearch:
             return None
         # Without linear rows the configuration at the place pose results from the path.
         place = pick if self._goal.X_TO_place is None else None
-        ends_at_q_place = self._robot.vertical_tool_rows is not None or candidate.is_tilted
+        ends_at_q_place = self._robot.vertical_tool_rows is not None or not has_same_tilt(
+            candidate.X_TG_pick, candidate.X_TG_place
+        )
         if place is None and ends_at_q_place:
             place = self._place_endpoint(candidate, candidate.q_place)
             if place is None:
@@ -326,8 +369,10 @@ class PickPlaceSearch:
         )
         # In a bowl or a mug, the gripper rises above the rim before it moves sideways.
         recess = max(0.0, self._picked.top_height - candidate.X_TG_pick[2, 3])
+        if candidate.is_sideways:
+            recess = 0.0
         if self._goal.X_TO_place is not None:  # else it is only lifted, straight up
-            gripper_height += self._segments.load_distance(candidate.tool)
+            gripper_height += candidate.load_distance
         for bottom in self._transfer_heights:
             self.num_attempts += 1
             height = bottom + recess + gripper_height
@@ -352,12 +397,28 @@ class PickPlaceSearch:
         may stand below the object.
         """
         tool = self._tools[candidate.tool]
-        if self._goal.X_TO_place is None:
-            lift = tool.lift_path(candidate.X_TG_pick, height, candidate.q_pick)
-            return "above the grasp" if lift is None else CarryPath(lift, lift[-1:], lift[-1:])
         ends = candidate.X_TG_pick, candidate.X_TG_place
+        placed = replace(self._picked, X_TO=self._X_TO_goal)
+        way_out, way_in = (
+            self._way_out(o, X_TG, candidate.load_distance)
+            for o, X_TG in zip((self._picked, placed), ends, strict=True)
+        )
+        if self._is_held:
+            way_out = WayOut()
+        if not self._goal.releases:
+            way_in = WayOut()
+        if self._goal.X_TO_place is None:
+            lift, approach = (
+                tool.lift_path(ends[0], height, candidate.q_pick, way_out, has_load=has_load)
+                for has_load in (True, False)
+            )
+            if lift is None or approach is None:
+                return "above the grasp"
+            return CarryPath(lift, lift[-1:], lift[-1:], approach, lift[-1:])
         for _ in range(_MAX_RAISES + 1):
-            path = tool.carry_path(*ends, height, candidate.q_pick, candidate.q_place)
+            path = tool.carry_path(
+                *ends, height, candidate.q_pick, candidate.q_place, (way_out, way_in)
+            )
             if isinstance(path, str):
                 break
             shortfall = -self._segments.carry_columns(candidate).slack(path.waypoints)

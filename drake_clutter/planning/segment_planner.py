@@ -122,10 +122,6 @@ class SegmentPlanner:
         self._failures = failures
         self._tools = tools
         self._robot = load_robot(cell.robot)
-        mass = picked.object_class.mass
-        self._load_distances = {
-            name: config.carry_clearance.of_load(cell.gripper.sag(name, mass)) for name in tools
-        }
         self._limits = dict[Payload, MotionLimits]()
         self._columns: dict[GraspCandidate, CarryColumns] = {}
         self._grasp_contacts = {
@@ -138,10 +134,6 @@ class SegmentPlanner:
         if payload not in self._limits:
             self._limits[payload] = MotionLimits(self._cell, payload)
         return self._limits[payload]
-
-    def load_distance(self, tool: str) -> float:
-        """Return the distance that a held object keeps in addition to `min_distance` [m]."""
-        return self._load_distances[tool]
 
     def min_distance_along(
         self, path: Floats, endpoint: EndpointContext, progress: int, stage: str
@@ -193,7 +185,7 @@ class SegmentPlanner:
         offsets = np.hypot(*(p_TG[:, :2] - endpoint.p_TG_xy).T)
         contacts = dict.fromkeys(self._grasp_contacts[endpoint.tool], self._config.lip_gap / 2)
         required = np.full(len(found.rows), min_distance)
-        required[self._collision_model.is_of_attached(found)] += self.load_distance(endpoint.tool)
+        required[self._collision_model.is_of_attached(found)] += endpoint.load_distance
         for pair, allowed in {**endpoint.allowed_distances, **contacts}.items():
             of_pair = self._collision_model.is_between(found, pair)
             required[of_pair] = np.minimum(
@@ -222,14 +214,20 @@ class SegmentPlanner:
             if distance.pair[0] in links and distance.pair[1] in below
         }
 
-    def contact_distances(self, q: Floats) -> dict[tuple[str, str], float]:
+    def contact_distances(
+        self, candidate: GraspCandidate, q: Floats
+    ) -> dict[tuple[str, str], float]:
         """Return the allowed distances to neighbors of the attached object, by names [m].
 
         They also bound what trajectory optimization keeps: it cannot increase the distances of
         neighbors of a vertical line.
+
+        Args:
+            candidate: Grasp.
+            q: Joint positions at an endpoint. Shape (n,).
         """
         name = self._picked.name
-        reach = self._config.min_distance + max(self._load_distances.values()) + OPTIMIZATION_MARGIN
+        reach = self._config.min_distance + candidate.load_distance + OPTIMIZATION_MARGIN
         distances = self._collision_model.distances_below(q, reach)
         of_object = [distance for distance in distances if distance.pair[0] == name]
         # A neighbor may have several geometries: the smallest distance is the last and is kept.
@@ -252,8 +250,8 @@ class SegmentPlanner:
         empty = Payload()
         tool = self._tools[candidate.tool]
         # Without the object the tool leaves it upwards before it moves sideways.
-        lift = tool.extend_upwards(carry_path.lift, candidate.insertion)
-        lowering = tool.extend_upwards(carry_path.reversed_lowering, candidate.insertion)
+        lift = tool.extend_upwards(carry_path.reversed_approach, candidate.insertion)
+        lowering = tool.extend_upwards(carry_path.retreat, candidate.insertion)
         if lift is None or lowering is None:
             self._failures.record(3, PlanningFailureReason.UNREACHABLE, "above the object")
             return None
@@ -262,12 +260,12 @@ class SegmentPlanner:
             "carry": ([carry_path.waypoints], candidate.payload)
         }
         if self._start is not None:
-            to_start = self._paths_between(tool, lift[-1], self._start)
+            to_start = self._paths_between(tool, lift[-1], self._start, candidate)
             approaches = (np.vstack([lift, path[1:]])[::-1] for path in to_start)
             candidates["approach"] = (approaches, empty)
         if self._releases:
             q_end = lowering[-1] if self._end is None else self._end
-            to_end = self._paths_between(tool, lowering[-1], q_end)
+            to_end = self._paths_between(tool, lowering[-1], q_end, candidate)
             candidates["retreat"] = ((np.vstack([lowering, path[1:]]) for path in to_end), empty)
         # All paths are checked for collisions before any is timed, which takes longer.
         free_paths = dict[str, Iterator[_FreePath]]()
@@ -295,17 +293,20 @@ class SegmentPlanner:
             for name, (_, payload) in candidates.items()
         }
 
-    def _paths_between(self, tool: ToolKinematics, q: Floats, q_end: Floats) -> Iterator[Floats]:
+    def _paths_between(
+        self, tool: ToolKinematics, q: Floats, q_end: Floats, candidate: GraspCandidate
+    ) -> Iterator[Floats]:
         """Yield candidate paths of an arm without an object. Shapes (m, n).
 
-        Between home and a grasp there are alternatives: other grasps and inverse kinematics
-        solutions. From and to any other configuration, RRT-Connect comes last.
+        Between home and a grasp from above there are alternatives: other grasps and inverse
+        kinematics solutions. From and to any other configuration, RRT-Connect comes last.
         """
         if np.array_equal(q, q_end):
             yield q_end[None]
             return
         yield from tool.paths_between(q, q_end)
-        if np.array_equal(q_end, self._robot.home) or self._num_tree_searches == MAX_TREE_SEARCHES:
+        is_from_home = np.array_equal(q_end, self._robot.home) and not candidate.is_sideways
+        if is_from_home or self._num_tree_searches == MAX_TREE_SEARCHES:
             return
         self._num_tree_searches += 1
         transfer = TransferPlanner(self._cell, self._config, tool, self._collision_model)
@@ -433,7 +434,7 @@ class SegmentPlanner:
                     self._X_TO_place,
                     candidate,
                     self._tools[candidate.tool],
-                    self._config.min_distance + self.load_distance(candidate.tool),
+                    self._config.min_distance + candidate.load_distance,
                     self._config.carry_clearance,
                     starts_at_rest=self._start is not None,
                     ends_at_rest=self._releases,

@@ -19,8 +19,16 @@ Floats = NDArray[np.float64]
 
 DEPARTURE_DISTANCE = 0.02
 """Distance that a tilted tool moves along its axis at the start of a lift [m]."""
+RISE_CORNER = 0.006
+"""Length over which the path of a load changes from its first rise to horizontal motion [m]."""
+_MAX_AXIAL_TILT = math.radians(46)
+"""Largest tilt of a tool that a load leaves its place with along the axis of the tool [rad]: grasps
+from above have up to 45 deg."""
 _CORNER_HEIGHT = 0.02
 """Height over which a path changes from vertical to horizontal motion [m]."""
+_MAX_TILT_DIFFERENCE = 1e-3
+"""Largest difference of vertical directions in a tool that count as equal: objects at rest are
+tilted by less."""
 _MAX_POSE_STEP = 0.02
 """Largest distance between neighboring poses of a straight line [m]."""
 
@@ -97,12 +105,87 @@ def is_vertical(X_TG: Floats) -> bool:
     return bool(X_TG[2, 2] < -1 + 1e-6)
 
 
-def _departure(X_TG: Floats, top: float) -> Floats:
-    """Return poses along -z of G for a short distance, then up to a height [m]. Shape (m, 4, 4)."""
+def is_sideways(X_TG: Floats) -> bool:
+    """Return whether a tool touches a side of an object at a pose. Shape (4, 4)."""
+    return bool(X_TG[2, 2] > -math.cos(_MAX_AXIAL_TILT))
+
+
+def has_same_tilt(X_TG: Floats, X_TG_end: Floats) -> bool:
+    """Return whether gravity has the same direction in a tool at two poses. Shapes (4, 4)."""
+    if is_vertical(X_TG) and is_vertical(X_TG_end):
+        return True
+    return bool(np.abs(X_TG[2, :3] - X_TG_end[2, :3]).max() < _MAX_TILT_DIFFERENCE)
+
+
+def departure_axis(X_TG: Floats) -> Floats:
+    """Return the direction in which a load leaves its place in a tool. Shapes (3,), (4, 4).
+
+    A load that is held at a side is lifted: it would drag on what it stands on.
+    """
+    return np.array([0.0, 0.0, 1.0]) if is_sideways(X_TG) else -X_TG[:3, 2]
+
+
+@dataclass(frozen=True)
+class WayOut:
+    """Motion of a tool on a side of an object from below what is above the object.
+
+    Attributes:
+        rise: Height by which a load is lifted first [m].
+        distance: Distance that the load moves horizontally then [m]; 0 if nothing is above.
+    """
+
+    rise: float = 0.0
+    distance: float = 0.0
+
+
+def _departure(X_TG: Floats, top: float, way_out: WayOut, *, has_load: bool) -> Floats:
+    """Return poses from an endpoint up to a height.
+
+    A tool that is tilted moves along -z of G for a short distance first. On a side of an object, it
+    moves along -z as far as the way out, and a load rises before it does.
+
+    Args:
+        X_TG: Pose at the endpoint. Shape (4, 4).
+        top: Height of G at the end [m].
+        way_out: Way out of a tool on a side of an object.
+        has_load: Whether the tool holds the object.
+
+    Returns:
+        Poses. Shape (m, 4, 4).
+    """
     if is_vertical(X_TG):
         return _vertical_line(X_TG, top)
-    moved_back = retreat_along_axis(X_TG, DEPARTURE_DISTANCE)
-    return np.vstack([X_TG[None], _vertical_line(moved_back, max(top, moved_back[2, 3]))])
+    if not is_sideways(X_TG):
+        moved_back = retreat_along_axis(X_TG, DEPARTURE_DISTANCE)
+        return np.vstack([X_TG[None], _vertical_line(moved_back, max(top, moved_back[2, 3]))])
+    parts = list[Floats]()
+    end = X_TG
+    if not has_load:
+        parts.append(_translated(end, -X_TG[:3, 2], max(way_out.distance, DEPARTURE_DISTANCE)))
+    elif way_out.distance > 0:
+        parts.append(_translated(end, np.array([0.0, 0.0, 1.0]), way_out.rise))
+        end = parts[-1][-1]
+        outwards = -X_TG[:3, 2] * [1.0, 1.0, 0.0]
+        parts.append(_translated(end, outwards / np.linalg.norm(outwards), way_out.distance))
+    end = parts[-1][-1] if parts else X_TG
+    return np.vstack([*parts, _vertical_line(end, max(top, end[2, 3]))])
+
+
+def _translated(X_TG: Floats, direction: Floats, distance: float) -> Floats:
+    """Return poses along a straight line, with short steps at its ends. Shape (m, 4, 4).
+
+    Args:
+        X_TG: First pose. Shape (4, 4).
+        direction: Direction in T, a unit vector. Shape (3,).
+        distance: Length of the line [m].
+    """
+    corner = min(RISE_CORNER, distance / 2)
+    count = math.ceil((distance - 2 * corner) / _MAX_POSE_STEP) + 1
+    between = np.linspace(corner, distance - corner, max(count, 2))
+    steps = np.array([0.0, corner / 2, *between, distance - corner / 2, distance])
+    X = np.broadcast_to(X_TG, (len(steps), 4, 4)).copy()
+    X[:, :3, 3] += steps[:, None] * direction
+    return X
 
 
 def _straight_line(X_TG: Floats, X_TG_end: Floats) -> Floats:
@@ -132,18 +215,22 @@ class CarryPath:
     """Joint-space path from the grasp to the place pose over a transfer height.
 
     Attributes:
-        lift: Vertically up from the grasp. Shape (k, n).
+        lift: Up from the grasp. Shape (k, n).
         transfer: From the end of `lift` to the end of `reversed_lowering`. Shape (l, n).
-        reversed_lowering: Vertically up from the place pose; traversed in reverse. Shape (m, n).
+        reversed_lowering: Up from the place pose; traversed in reverse. Shape (m, n).
+        reversed_approach: Up from the grasp without the object; traversed in reverse. Shape (i, n).
+        retreat: Up from the place pose without the object. Shape (j, n).
     """
 
     lift: Floats
     transfer: Floats
     reversed_lowering: Floats
+    reversed_approach: Floats
+    retreat: Floats
 
     @property
     def waypoints(self) -> Floats:
-        """Configurations from grasp to place pose without duplicates. Shape (j, n)."""
+        """Configurations from grasp to place pose without duplicates. Shape (m, n)."""
         return np.vstack([self.lift, self.transfer[1:-1], self.reversed_lowering[::-1]])
 
 
@@ -226,13 +313,15 @@ class ToolKinematics:
         transfer_height: float,
         q_pick: Floats,
         q_place: Floats,
+        ways_out: tuple[WayOut, WayOut],
     ) -> CarryPath | str:
         """Return a path from a grasp to a place pose.
 
-        A tilted tool first moves along its axis, also at the place pose. A robot with
-        `vertical_tool_rows` keeps a vertical tool vertical on a straight line in joint space; a
-        tilted tool turns on such a line. Any other robot moves a vertical tool on a straight line;
-        its configuration at the place pose results from the path.
+        A tilted tool first moves along its axis, also at the place pose; on a side of the object,
+        it takes its way out. A robot with `vertical_tool_rows` keeps the tilt of a vertical or a
+        horizontal tool on a straight line in joint space; any other tilted tool turns on such a
+        line. Any other robot moves a tool that keeps its tilt on a straight line; its configuration
+        at the place pose results from the path.
 
         Args:
             X_pick: X_TG at the grasp. Shape (4, 4).
@@ -240,30 +329,43 @@ class ToolKinematics:
             transfer_height: Height of G between the two [m].
             q_pick: Joint positions at the grasp. Shape (n,).
             q_place: Joint positions at the place pose; not used without `vertical_tool_rows` if the
-                tool is vertical. Shape (n,).
+                tool keeps its tilt. Shape (n,).
+            ways_out: Ways out at the grasp and at the place pose.
 
         Returns:
             The path, or a description of the part that is out of reach.
         """
-        lift = self.lift_path(X_pick, transfer_height, q_pick)
+        lift = self.lift_path(X_pick, transfer_height, q_pick, ways_out[0], has_load=True)
         if lift is None:
             return "above the grasp"
-        above_place = _departure(X_place, transfer_height)
-        stays_vertical = is_vertical(X_pick) and is_vertical(X_place)
-        if self.robot.vertical_tool_rows is not None or not stays_vertical:
+        above_place = _departure(X_place, transfer_height, ways_out[1], has_load=True)
+        if self.robot.vertical_tool_rows is not None or not has_same_tilt(X_pick, X_place):
             reversed_lowering = self.track(above_place, q_place)
             if reversed_lowering is None:
                 return "above the place"
             transfer = linear_joint_path(lift[-1], reversed_lowering[-1])
-            return CarryPath(lift, transfer, reversed_lowering)
-        X_lifted = _departure(X_pick, transfer_height)[-1]
-        tracked = self.track(_straight_line(X_lifted, above_place[-1]), lift[-1])
-        if tracked is None:
-            return "between grasp and place"
-        lowering = self.track(above_place[::-1], tracked[-1])
-        if lowering is None:
-            return "above the place"
-        return CarryPath(lift, tracked, lowering[::-1])
+        else:
+            X_lifted = _departure(X_pick, transfer_height, ways_out[0], has_load=True)[-1]
+            tracked = self.track(_straight_line(X_lifted, above_place[-1]), lift[-1])
+            if tracked is None:
+                return "between grasp and place"
+            lowering = self.track(above_place[::-1], tracked[-1])
+            if lowering is None:
+                return "above the place"
+            transfer, reversed_lowering = tracked, lowering[::-1]
+        approach, retreat = (
+            self.lift_path(X_TG, transfer_height, path[0], way_out, has_load=False)
+            if is_sideways(X_TG)
+            else path
+            for X_TG, path, way_out in zip(
+                (X_pick, X_place), (lift, reversed_lowering), ways_out, strict=True
+            )
+        )
+        if approach is None:
+            return "before the grasp"
+        if retreat is None:
+            return "before the place"
+        return CarryPath(lift, transfer, reversed_lowering, approach, retreat)
 
     def extend_upwards(self, path: Floats, distance: float) -> Floats | None:
         """Return a path with a vertical line of the tool at its end.
@@ -281,18 +383,22 @@ class ToolKinematics:
         line = self.track(_vertical_line(X_TG, X_TG[2, 3] + distance), path[-1])
         return None if line is None else np.vstack([path, line[1:]])
 
-    def lift_path(self, X_TG: Floats, height: float, q: Floats) -> Floats | None:
+    def lift_path(
+        self, X_TG: Floats, height: float, q: Floats, way_out: WayOut, *, has_load: bool
+    ) -> Floats | None:
         """Return the path from a grasp up to a height; a tilted tool first moves along its axis.
 
         Args:
             X_TG: Pose of the tool at the grasp. Shape (4, 4).
             height: Height of G at the end [m].
             q: Joint positions at the grasp. Shape (n,).
+            way_out: Way out of a tool on a side of the object.
+            has_load: Whether the tool holds the object.
 
         Returns:
             Configurations, shape (m, n), or None out of reach.
         """
-        return self.track(_departure(X_TG, height), q)
+        return self.track(_departure(X_TG, height, way_out, has_load=has_load), q)
 
     def paths_between(self, q: Floats, q_end: Floats) -> list[Floats]:
         """Return candidate paths between two configurations. Shapes (m, n).
