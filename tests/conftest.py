@@ -139,7 +139,16 @@ def rng(seed: int = 0) -> np.random.Generator:
 
 OPTIONAL = (
     *("torch", "safetensors", "tensorboard", "threadpoolctl", "ray", "pybullet"),
-    *("av", "foxglove_schemas_protobuf", "lerobot", "mcap", "mcap_protobuf", "pyarrow", "rerun"),
+    *(
+        "av",
+        "foxglove_schemas_protobuf",
+        "lerobot",
+        "mcap",
+        "mcap_protobuf",
+        "pxr",
+        "pyarrow",
+        "rerun",
+    ),
 )
 """Optional packages; tests that need a missing one are skipped."""
 _MISSING = "|".join(name for name in OPTIONAL if importlib.util.find_spec(name) is None)

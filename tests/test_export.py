@@ -44,9 +44,12 @@ MAIN_FILES = {
     ExportFormat.SDF: "scene.sdf",
     ExportFormat.MJCF: "scene.xml",
     ExportFormat.GLB: "scene.glb",
+    ExportFormat.USD: "scene.usda",
 }
 REFERENCE = re.compile(
-    r'<uri>(.*?)</uri>|file="(.*?)"|^mtllib (.*)$|^map_Kd (.*)$|^ *file: (.*)$', re.MULTILINE
+    r'<uri>(.*?)</uri>|file="(.*?)"|^mtllib (.*)$|^map_Kd (.*)$|^ *file: (.*)$'
+    r"|asset inputs:file = @(.*?)@",
+    re.MULTILINE,
 )
 BULLET = 1e-5
 
@@ -259,6 +262,27 @@ def check_in_trimesh(scene: Scene, main_file: Path) -> None:
     )
 
 
+def check_in_usd(scene: Scene, main_file: Path) -> None:
+    from pxr import Usd, UsdGeom, UsdPhysics
+
+    stage = Usd.Stage.Open(str(main_file))
+    objects = stage.GetPrimAtPath("/scene/objects").GetChildren()
+    names = [prim.GetDisplayName() or prim.GetName() for prim in objects]
+    assert names == list(scene.names)
+    bounds = UsdGeom.BBoxCache(0, [UsdGeom.Tokens.guide])
+    for prim, name in zip(objects, names, strict=True):
+        X_TO = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(0)).T
+        check(scene, name, UsdPhysics.MassAPI(prim).GetMassAttr().Get(), X_TO)
+        colliders = [child for child in prim.GetChildren() if child.GetName() != "visual"]
+        assert len(colliders) == len(scene[name].object_class.convex_pieces)
+        boxes = [bounds.ComputeLocalBound(child).ComputeAlignedRange() for child in colliders]
+        corners = scene[name].object_class.corners
+        low = np.min([box.GetMin() for box in boxes], axis=0)
+        high = np.max([box.GetMax() for box in boxes], axis=0)
+        assert low == pytest.approx(corners.min(axis=0), abs=2e-4)
+        assert high == pytest.approx(corners.max(axis=0), abs=2e-4)
+
+
 def test_reads_back(exported: tuple[ExportFormat, Path], scene: Scene, bullet: int) -> None:
     format, main_file = exported
     if format is ExportFormat.DMD:
@@ -268,6 +292,8 @@ def test_reads_back(exported: tuple[ExportFormat, Path], scene: Scene, bullet: i
         check_in_pybullet(scene, main_file, bullet)
     elif format is ExportFormat.MJCF:
         check_in_mujoco(scene, main_file)
+    elif format is ExportFormat.USD:
+        check_in_usd(scene, main_file)
     else:
         check_in_trimesh(scene, main_file)
 
@@ -291,12 +317,14 @@ def test_refers_to_nothing_outside(exported: tuple[ExportFormat, Path], scene: S
         assert "file:" not in text.replace("    file: package:", "")
         for scene_object in scene.objects:
             assert str(scene_object.object_class.folder.parent) not in text
-    assert references >= len(scene.objects) or main_file.suffix == ".glb"
+    # USD refers to a texture of each class.
+    expected = {".glb": 0, ".usda": len({o.object_class for o in scene.objects})}
+    assert references >= expected.get(main_file.suffix, len(scene.objects))
 
 
 def test_textures_are_the_labels(exported: tuple[ExportFormat, Path], scene: Scene) -> None:
     format, main_file = exported
-    if format in (ExportFormat.SDF, ExportFormat.MJCF):
+    if format in (ExportFormat.SDF, ExportFormat.MJCF, ExportFormat.USD):
         for object_class in {scene_object.object_class for scene_object in scene.objects}:
             with Image.open(main_file.parent / object_class.name / "label.png") as picture:
                 label = load_visual(object_class).visual.material.baseColorTexture.convert("RGB")

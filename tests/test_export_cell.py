@@ -220,6 +220,6 @@ def test_arm_rests_at_home(tmp_path: Path) -> None:
 
 
 def test_only_some_formats_hold_a_cell(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="sdf cannot hold the cell; expected one of mjcf"):
+    with pytest.raises(InputError, match="sdf cannot hold the cell; expected one of mjcf, usd"):
         export_scene(scene_of(resting("sugar_box")), ExportFormat.SDF, tmp_path, cell=DEFAULT_CELL)
     assert not list(tmp_path.iterdir())

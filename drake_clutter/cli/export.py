@@ -16,6 +16,7 @@ class Format(Enum):
     SDF = "sdf"
     MJCF = "mjcf"
     GLB = "glb"
+    USD = "usd"
 
 
 def export(
@@ -25,14 +26,14 @@ def export(
         Format,
         typer.Option(
             help="dmd: Drake model directives. sdf: PyBullet, Gazebo. mjcf: MuJoCo. glb: 3-D "
-            "viewers."
+            "viewers. usd: Isaac Sim and other readers of UsdPhysics."
         ),
     ],
     with_cell: Annotated[
         bool,
         typer.Option(
             "--with-cell",
-            help="Export arm, gripper, pedestal, cameras and fixtures, too (mjcf).",
+            help="Export arm, gripper, pedestal, cameras and fixtures, too (mjcf, usd).",
         ),
     ] = False,
     initial_poses: InitialPosesOption = False,

@@ -1,4 +1,4 @@
-"""Export of a scene for Drake, SDFormat simulators, MuJoCo or glTF viewers."""
+"""Export of a scene for Drake, SDFormat simulators, MuJoCo, USD or glTF viewers."""
 
 from drake_clutter.export.export_folder import ExportFormat, export_scene
 

@@ -1,5 +1,6 @@
 """The folder of an export, which appears complete or not at all."""
 
+import importlib.util
 import os
 import re
 import shutil
@@ -28,6 +29,7 @@ class ExportFormat(Enum):
     SDF = "sdf"
     MJCF = "mjcf"
     GLB = "glb"
+    USD = "usd"
 
 
 _SCENE_WRITERS = {
@@ -35,7 +37,18 @@ _SCENE_WRITERS = {
     ExportFormat.SDF: write_sdf,
     ExportFormat.GLB: write_glb,
 }
-_CELL_WRITERS = {ExportFormat.MJCF: write_mjcf}
+
+
+def _write_usd(scene: Scene, folder: Path, cell: WorkCell | None) -> Path:
+    """Write a USD stage with usd-core, which is optional."""
+    if importlib.util.find_spec("pxr") is None:
+        raise InputError("format: usd: needs usd-core; install drake_clutter with [data]")
+    from drake_clutter.export.usd_writer import write_usd
+
+    return write_usd(scene, folder, cell)
+
+
+_CELL_WRITERS = {ExportFormat.MJCF: write_mjcf, ExportFormat.USD: _write_usd}
 """Writers of formats that can hold a work cell, too."""
 
 
@@ -55,7 +68,8 @@ def export_scene(
             fixtures; None for the scene alone, on a table.
 
     Returns:
-        The file to open: `scene.dmd.yaml`, `scene.sdf`, `scene.xml` or `scene.glb` in `out`.
+        The file to open: `scene.dmd.yaml`, `scene.sdf`, `scene.xml`, `scene.glb` or `scene.usda` in
+            `out`.
 
     Raises:
         InputError: A format does not allow an object's name, or cannot hold a cell; or a class has

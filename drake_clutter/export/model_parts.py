@@ -153,15 +153,21 @@ def deflate_convex_mesh(path: Path, deflated: Path, margin: float) -> None:
     deflated.write_text(text, encoding="utf-8")
 
 
-def write_shape_mesh(shape: Mesh | Convex, path: Path) -> None:
-    """Write the mesh of a shape as an OBJ file in the scale and axes of the shape."""
-    source = shape.source().path()
-    with reading_file(source, "a mesh"):
-        mesh = trimesh.load_mesh(source)
-    if source.suffix == ".gltf":
+def load_shape_mesh(shape: Mesh | Convex) -> Any:
+    """Return the mesh of a shape, a `trimesh.Trimesh` in the scale and axes of the shape."""
+    path = shape.source().path()
+    with reading_file(path, "a mesh"):
+        mesh = trimesh.load_mesh(path)
+    if path.suffix == ".gltf":
         mesh.apply_transform(Y_UP_TO_Z_UP)
     mesh.apply_scale(shape.scale3())
-    path.write_text(trimesh.exchange.obj.export_obj(mesh, include_texture=False), encoding="utf-8")
+    return mesh
+
+
+def write_shape_mesh(shape: Mesh | Convex, path: Path) -> None:
+    """Write the mesh of a shape as an OBJ file."""
+    text = trimesh.exchange.obj.export_obj(load_shape_mesh(shape), include_texture=False)
+    path.write_text(text, encoding="utf-8")
 
 
 def write_class_meshes(object_class: ObjectClass, folder: Path) -> list[str]:
