@@ -34,6 +34,10 @@ GripperSpec = Annotated[SuctionGripper | ParallelJawGripper, Field(discriminator
 """Gripper of a cell file: a model that satisfies `Gripper`."""
 DEFAULT_CELL = "models/cells/ur10_epick_tray.yaml"
 """Resource path of the default cell file."""
+DEFAULT_WRIST_CAMERA = Camera(
+    pose=PoseSpec(translation=(0.0, -0.10, 0.04), rpy_deg=(-15.0, 0.0, 0.0))
+)
+"""RealSense D435 beside the flange that is tilted towards the tool; an assumed mounting."""
 _RESERVED_NAMES = ("tray", "camera", "pedestal", "robot", "gripper")
 """Names that fixtures may not have: those of the other parts of a cell."""
 
@@ -47,6 +51,8 @@ class WorkCell(StrictModel):
         support: Tray or shelf board on which the objects stand.
         cameras: Cameras by name; explorers observe the scene with the first one.
         fixtures: Fixed obstacles.
+        wrist_camera: Camera on the flange, whose images are recorded; its `pose` is X_FC. It is a
+            sensor without a body.
     """
 
     robot: RobotSpec
@@ -54,6 +60,7 @@ class WorkCell(StrictModel):
     support: Support
     cameras: Annotated[dict[NonEmptyText, Camera], Field(min_length=1)]
     fixtures: tuple[Fixture, ...] = ()
+    wrist_camera: Camera = DEFAULT_WRIST_CAMERA
 
     @field_validator("gripper", mode="before")
     @classmethod

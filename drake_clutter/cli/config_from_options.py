@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from drake_clutter.config import ClutterConfig
     from drake_clutter.scenes.scene_file import SceneFile
 
-CELL_FIELDS = frozenset({"robot", "gripper", "support", "cameras", "fixtures"})
+CELL_FIELDS = frozenset({"robot", "gripper", "support", "cameras", "fixtures", "wrist_camera"})
 """Fields of the work cell, which settings may name without the prefix `cell.`."""
 _SUPPORT_FIELDS = (
     "cell.support",
