@@ -9,8 +9,9 @@ from scipy.spatial import ConvexHull
 from drake_clutter.cell.camera import Camera
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
+from drake_clutter.rendering.mesh_renderer import RenderedImages
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
-from drake_clutter.simulation.camera_renderer import CameraRenderer, RenderedImages
+from drake_clutter.simulation.camera_renderer import CameraRenderer
 
 UPRIGHT = Orientation.UPRIGHT_0
 BELOW = resting("cracker_box", name="below")  # 230 mm x 160 mm, 60 mm high

@@ -16,7 +16,7 @@ FLOORS = {
         *("validation", "visual_mesh", "workers", "yaml_io"),
     },
     1: {"cell", "config", "grammar"},
-    2: {"robots", "scenes", "stability"},
+    2: {"rendering", "robots", "scenes", "stability"},
     3: {"export", "simulation"},
     4: {"perception", "planning"},
     5: {"tasks"},

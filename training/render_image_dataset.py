@@ -48,12 +48,12 @@ from drake_clutter.perception.image_dataset import (
     LabeledImage,
     write_images,
 )
+from drake_clutter.rendering.mesh_renderer import RenderedImages
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.camera_renderer import (
     RENDER_ENGINE_PARAMS,
     CameraRenderer,
-    RenderedImages,
 )
 from drake_clutter.simulation.drop import sample_drop_scene, simulate_drop
 from drake_clutter.validation import to_plain

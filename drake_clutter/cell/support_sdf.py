@@ -15,16 +15,16 @@ _TABLE_SIZE = (2.4, 2.4, 0.04)
 _TABLE_GAP = 0.001
 """Gap between a support that stands on the table and the table, as in the shipped cells [m]: Drake
 is unreliable where faces just touch."""
-_FLOOR_COLOR = "0.72 0.60 0.46 1"
-_WALL_COLOR = "0.55 0.42 0.30 1"
-_TABLE_COLOR = "0.70 0.70 0.70 1"
+_FLOOR_COLOR = (0.72, 0.60, 0.46)
+_WALL_COLOR = (0.55, 0.42, 0.30)
+_TABLE_COLOR = (0.70, 0.70, 0.70)
 _WALL_NAMES = {"+x": "rim_front", "-x": "rim_back", "+y": "rim_left", "-y": "rim_right"}
 """Name of the geometry of each wall."""
 
 _Vector = tuple[float, float, float]
 
 
-def _box(name: str, size: _Vector, p_TG: _Vector, color: str) -> str:
+def _box(name: str, size: _Vector, p_TG: _Vector, color: _Vector) -> str:
     box = f"""<pose>{" ".join(f"{v:.6g}" for v in p_TG)} 0 0 0</pose>
         <geometry>
           <box><size>{" ".join(f"{v:.6g}" for v in size)}</size></box>
@@ -33,7 +33,7 @@ def _box(name: str, size: _Vector, p_TG: _Vector, color: str) -> str:
       <visual name="{name}">
         {box}
         <material>
-          <diffuse>{color}</diffuse>
+          <diffuse>{" ".join(f"{v:.2f}" for v in color)} 1</diffuse>
         </material>
       </visual>
       <collision name="{name}">
@@ -61,6 +61,11 @@ def support_boxes(support: Support) -> list[tuple[str, _Vector, _Vector]]:
     ]
 
 
+def support_color(name: str) -> _Vector:
+    """Return red, green and blue in [0, 1] of the floor or a wall."""
+    return _FLOOR_COLOR if name == FLOOR else _WALL_COLOR
+
+
 def table_box(support: Support) -> tuple[str, _Vector, _Vector]:
     """Return name, size [m] and center in T [m] of the table under a support."""
     z = support.table_height - _TABLE_GAP - _TABLE_SIZE[2] / 2
@@ -76,8 +81,7 @@ def support_sdf(support: Support, *, table: bool) -> str:
             a work cell, the table is a fixture.
     """
     boxes = [
-        _box(name, size, p_TG, _FLOOR_COLOR if name == FLOOR else _WALL_COLOR)
-        for name, size, p_TG in support_boxes(support)
+        _box(name, size, p_TG, support_color(name)) for name, size, p_TG in support_boxes(support)
     ]
     if table:
         boxes.append(_box(*table_box(support), _TABLE_COLOR))

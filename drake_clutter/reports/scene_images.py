@@ -14,9 +14,10 @@ from scipy.ndimage import find_objects
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.support import Support
 from drake_clutter.cell.work_cell import default_cell
+from drake_clutter.rendering.mesh_renderer import RenderedImages
 from drake_clutter.reports.canvas import Canvas, Rectangle, TextLabel, innermost_point
 from drake_clutter.scenes.scene import Pose, Scene
-from drake_clutter.simulation.camera_renderer import CameraRenderer, RenderedImages
+from drake_clutter.simulation.camera_renderer import CameraRenderer
 from drake_clutter.simulation.scene_plant import pose_from_transform
 
 OVERHEAD_SIZE = (720, 720)

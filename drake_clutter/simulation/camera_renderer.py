@@ -18,6 +18,7 @@ from pydrake.geometry import (
     QueryObject,
     RenderCameraCore,
     RenderEngineVtkParams,
+    Rgba,
 )
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import DiagramBuilder
@@ -28,44 +29,52 @@ from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.pinhole import MAX_DEPTH
 from drake_clutter.cell.support import Support
 from drake_clutter.files import reading_file
+from drake_clutter.rendering.lighting import CAMERA_LIGHTING, Lamp, LampKind, Lighting
+from drake_clutter.rendering.mesh_renderer import MIN_SENSOR_DEPTH, NEAR_DEPTH, RenderedImages
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.scene_plant import ScenePlant, add_scene_plant, rigid_transform
 
 RENDERER_NAME = "vtk"
 """Name of the render engine in the scene graph."""
 
-RENDER_ENGINE_PARAMS = RenderEngineVtkParams(
-    backend="EGL",
-    lights=[
-        LightParameter(
-            type="directional", direction=[0.2, 0.1, 1.0], frame="camera", intensity=2.4
-        ),
-        LightParameter(
-            type="directional", direction=[-0.8, -0.5, 1.0], frame="camera", intensity=0.9
-        ),
-    ],
-)
-"""Render engine with two lights beside the camera.
-
-The second light keeps faces that are turned away from the first one from being black.
-"""
-_NO_OBJECT = -1
+_BACKEND = "EGL"
 
 
-@dataclass(frozen=True)
-class RenderedImages:
-    """Rendered images of a scene.
+def make_engine_params(lighting: Lighting) -> RenderEngineVtkParams:
+    """Return the parameters of a render engine with some light.
 
-    Attributes:
-        color: sRGB image, uint8. Shape (height, width, 3).
-        depth: Depth along the camera's axis, inf where nothing is seen [m]. Shape (height, width).
-        label: Index of the object in the scene, -1 for the support and the background. Shape
-            (height, width).
+    The engine draws neither ambient light nor shadows of these lamps.
+
+    Args:
+        lighting: Light without ambient light and shadows.
     """
+    assert lighting.ambient == 0.0, "Drake's render engine has no ambient light"
+    red, green, blue = (value / 255 for value in lighting.background)
+    return RenderEngineVtkParams(
+        backend=_BACKEND,
+        default_clear_color=[red, green, blue],
+        lights=[_light_parameter(lamp, lighting.exposure) for lamp in lighting.lamps],
+    )
 
-    color: NDArray[np.uint8]
-    depth: NDArray[np.float32]
-    label: NDArray[np.int64]
+
+def _light_parameter(lamp: Lamp, exposure: float) -> LightParameter:
+    """Return a lamp for the render engine."""
+    assert not lamp.casts_shadows, "Drake's render engine draws no shadows of such lamps"
+    is_point = lamp.kind is LampKind.POINT
+    return LightParameter(
+        type=lamp.kind.value,
+        color=Rgba(*lamp.color),
+        attenuation_values=[0, 0, 1] if is_point else [1, 0, 0],
+        position=lamp.vector if is_point else (0.0, 0.0, 0.0),
+        direction=(0.0, 0.0, 1.0) if is_point else lamp.vector,
+        frame="camera" if lamp.is_on_camera else "world",
+        intensity=lamp.intensity * exposure,
+    )
+
+
+RENDER_ENGINE_PARAMS = make_engine_params(CAMERA_LIGHTING)
+"""Render engine with two lights beside the camera."""
+_NO_OBJECT = -1
 
 
 @dataclass(frozen=True)
@@ -89,12 +98,12 @@ class RenderCameras:
         """Return the render cameras of a camera."""
         info = CameraInfo(config.width, config.height, np.radians(config.fov_y_deg))
         anywhere = RenderCameraCore(
-            RENDERER_NAME, info, ClippingRange(0.05, 20.0), RigidTransform()
+            RENDERER_NAME, info, ClippingRange(NEAR_DEPTH, 20.0), RigidTransform()
         )
         over_tray = RenderCameraCore(
             RENDERER_NAME, info, _tray_clipping_range(config.X_TC), RigidTransform()
         )
-        depth = DepthRenderCamera(anywhere, DepthRange(0.1, MAX_DEPTH))
+        depth = DepthRenderCamera(anywhere, DepthRange(MIN_SENSOR_DEPTH, MAX_DEPTH))
         return RenderCameras(
             ColorRenderCamera(anywhere, False),
             depth,

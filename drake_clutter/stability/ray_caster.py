@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.pinhole import MIN_DEPTH, point_to_camera, project, vector_to_camera
 from drake_clutter.compilation import njit
+from drake_clutter.rendering.polygon_fill import fill_polygon
 from drake_clutter.scenes.interfaces import Detection, Observation
 from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.stability.shape_table import Floats, Ints, ShapeTable
@@ -60,13 +61,12 @@ def _cast_object(arrays, shape, p_TO, camera, label, nearest, hit):  # type: ign
         Number of rays that meet the object, whatever is in front of it. A ray through several
         pieces of an object counts several times.
     """
-    height, width = hit.shape
     p_TC = camera.p_TC
     p_x, p_y, p_z = vector_to_camera(camera, p_TO[0], p_TO[1], p_TO[2])
     u, v = np.empty(64), np.empty(64)
     # First column, and column after the last, of a face in each row.
-    begin = np.zeros(height, np.int64)
-    end = np.zeros(height, np.int64)
+    begin = np.zeros(hit.shape[0], np.int64)
+    end = np.zeros(hit.shape[0], np.int64)
     rays = 0
     for face in range(arrays.table[shape].first_face, arrays.table[shape].last_face):
         first, last = arrays.first_corner[face], arrays.first_corner[face + 1]
@@ -82,7 +82,6 @@ def _cast_object(arrays, shape, p_TO, camera, label, nearest, hit):  # type: ign
         count = last - first
         if count > len(u):
             u, v = np.empty(count), np.empty(count)
-        top, bottom = np.inf, -np.inf
         for c in range(count):
             x, y, z = point_to_camera(
                 camera,
@@ -91,39 +90,8 @@ def _cast_object(arrays, shape, p_TO, camera, label, nearest, hit):  # type: ign
                 arrays.corner[first + c, 2],
             )
             u[c], v[c] = project(camera, x + p_x, y + p_y, z + p_z)
-            top, bottom = min(top, v[c]), max(bottom, v[c])
-        along, down, start = _inverse_depth(camera, nx, ny, nz, k)
-        first_row = max(0, math.ceil(top))
-        last_row = min(height - 1, math.floor(bottom))
-        for c in range(count):
-            d = c + 1 if c + 1 < count else 0
-            # The end points are ordered downwards, so that an edge rounds alike for both of its
-            # faces: no ray is counted twice or lost.
-            leftmost = v[c] < v[d]
-            a, b = (c, d) if leftmost else (d, c)
-            first_below = max(first_row, math.ceil(v[a]))
-            last_below = min(last_row + 1, math.ceil(v[b]))
-            if first_below >= last_below:
-                continue
-            slope = (u[b] - u[a]) / (v[b] - v[a])
-            bound = begin if leftmost else end
-            for row in range(first_below, last_below):
-                bound[row] = min(max(math.ceil(u[a] + (row - v[a]) * slope), 0), width)
-        for row in range(first_row, last_row + 1):
-            first_column, last_column = begin[row], end[row]
-            if last_column <= first_column:
-                continue
-            rays += last_column - first_column
-            inverse = np.float32(start + down * row + along * first_column)
-            step = np.float32(along)
-            # Unconditional writes to slices that start at 0 let the compiler vectorize the loop.
-            nearest_here = nearest[row, first_column:last_column]
-            hit_here = hit[row, first_column:last_column]
-            for k in range(last_column - first_column):
-                value = inverse + step * np.float32(k)
-                nearer = value > nearest_here[k]
-                nearest_here[k] = value if nearer else nearest_here[k]
-                hit_here[k] = label if nearer else hit_here[k]
+        plane = _inverse_depth(camera, nx, ny, nz, k)
+        rays += fill_polygon(u, v, count, plane, label, nearest, hit, begin, end)
     return rays
 
 
