@@ -33,7 +33,7 @@ from drake_clutter.planning.cubic_spline import CubicSpline
 from drake_clutter.planning.motion_limits import MotionLimits
 from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.planning.segment_planner import MAX_REPORTED_DISTANCE
+from drake_clutter.planning.segment_check import MAX_REPORTED_DISTANCE
 from drake_clutter.planning.time_parameterization import (
     bspline_path,
     parameterize_time_optimal,

@@ -4,21 +4,23 @@ import math
 
 import numpy as np
 import pytest
-from conftest import cell_with, resting, rng
+from conftest import DEFAULT_CELL, cell_with, resting, rng
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import MultibodyForces
 
 from benchmarks.motion_limits import ROBOTS, cell_of, limit_ratios
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.planning.arm_dynamics import dynamics_plant
 from drake_clutter.planning.cubic_spline import MotionSamples
-from drake_clutter.planning.motion_limits import LimitKind, MotionLimits
+from drake_clutter.planning.motion_limits import LimitKind, MotionLimits, TiltedLoad
 from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.scene import Pose
+
+Floats = NDArray[np.float64]
 
 NUM_MOVES = 5
 """Moves of each robot."""
@@ -125,3 +127,30 @@ def test_ratios_of_a_motion_to_its_limits() -> None:
     )
     assert ratios.time_scales() == pytest.approx(scales, rel=2e-4)
     assert scales.max() < 1.0, "the motion may be faster"
+
+
+def test_a_load_in_a_tilted_tool_is_checked_at_its_tilt() -> None:
+    """A wrist that turns a load to the side leaves the cup less for its acceleration."""
+    gripper, mass, lever, acceleration = DEFAULT_CELL.gripper, 0.5, 0.03, 2.0
+    X_FG = gripper.tools["large"].X_FG
+    x, y, z = (X_FG @ np.array([0.0, 0.0, lever])).tolist()
+    load = TiltedLoad(DEFAULT_CELL, Payload(mass, (x, y, z)), "large")
+    radius, force, friction = 0.0125, 0.8 * 101325.0 * math.pi * 0.0125**2, 0.5
+    weight, push = mass * 9.81, mass * acceleration
+
+    def turned(degrees: float) -> Floats:
+        """Return R_BF of a tool that is turned from pointing down."""
+        angle = math.radians(degrees)
+        return np.array([RotationMatrix.MakeYRotation(math.pi - angle).matrix()])
+
+    (ratio,) = load.ratios(turned(0.0), np.array([[0.0, 0.0, acceleration]]))
+    at_rest = gripper.safety * weight / force
+    assert ratio == pytest.approx(gripper.safety * push / force / (1 - at_rest))
+    (ratio,) = load.ratios(turned(90.0), np.array([[0.0, 0.0, acceleration]]))
+    opening = 2 * lever / radius / force
+    at_rest = gripper.safety * weight * max(opening, 1 / (friction * force))
+    assert at_rest < 1
+    assert ratio == pytest.approx(gripper.safety * push * opening / (1 - at_rest))
+    heavy = TiltedLoad(DEFAULT_CELL, Payload(1.0, (x, y, z)), "large")
+    assert np.isfinite(heavy.ratios(turned(0.0), np.zeros((1, 3)))).all()
+    assert np.isinf(heavy.ratios(turned(90.0), np.zeros((1, 3)))).all()

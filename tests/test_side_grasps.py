@@ -9,6 +9,7 @@ import pytest
 from conftest import CLASSES, DEFAULT_CELL, cell_with, scene_of
 from numpy.typing import NDArray
 
+from benchmarks.motion_limits import limit_ratios
 from drake_clutter.cell.gripper import Grasp
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.files import InputError
@@ -150,6 +151,10 @@ def test_a_box_below_a_board_is_picked_from_its_side() -> None:
     assert failure.reason is PlanningFailureReason.IN_COLLISION
     plan = planner.plan([BOX], BOX.name, PLACE)
     assert isinstance(plan, PickPlacePlan)
+    assert plan.segments[1].duration < 0.9 * plan.segments[1].unoptimized_duration
+    ratios = limit_ratios(cell, plan, plan.segments[1])
+    assert max(ratios.values()) < 1.01
+    assert ratios["cup load"] > 0.5, "the weight alone"
     tool = planner.tools[plan.tool]
     approach, carry, _ = (segment.trajectory for segment in plan.segments)
     X_TG = tool.pose(carry.vector_values(np.linspace(0.0, carry.end_time(), 1000)).T)

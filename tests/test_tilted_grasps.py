@@ -8,6 +8,7 @@ import pytest
 from conftest import CLASSES, DEFAULT_CELL, resting, scene_of
 from scipy.spatial.transform import Rotation
 
+from benchmarks.motion_limits import limit_ratios
 from drake_clutter.config import ExplorationConfig
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
@@ -44,6 +45,10 @@ def test_a_leaning_box_is_put_down_flat(detector: LabelDetector) -> None:
     X_TG = tool.pose(carry.vector_values(np.linspace(0.0, carry.end_time(), 400)).T)
     assert X_TG[0, :3, 2] == pytest.approx(-NORMAL, abs=1e-3)
     assert X_TG[-1, :3, 2] == pytest.approx([0.0, 0.0, -1.0], abs=1e-3)
+    assert plan.segments[1].duration < 0.9 * plan.segments[1].unoptimized_duration
+    ratios = limit_ratios(DEFAULT_CELL, plan, plan.segments[1])
+    assert max(ratios.values()) < 1.01
+    assert 0.0 < ratios["cup load"] < 1.0, "with gravity in its true direction"
     lift = X_TG[:, :3, 3] - X_TG[0, :3, 3]
     along = lift @ NORMAL
     first = (along > 1e-4) & (along < DEPARTURE_DISTANCE / 2)

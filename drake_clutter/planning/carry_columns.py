@@ -15,11 +15,9 @@ from drake_clutter.planning.carry_clearance import (
     worst_slack,
 )
 from drake_clutter.planning.grasp_candidate import GraspCandidate
+from drake_clutter.planning.spline_program import LinearizedDistances
 from drake_clutter.planning.tool_kinematics import ToolKinematics
-from drake_clutter.planning.trajectory_optimization import (
-    INFLUENCE_DISTANCE,
-    LinearizedDistances,
-)
+from drake_clutter.planning.trajectory_optimization import INFLUENCE_DISTANCE
 from drake_clutter.scenes.scene import Pose, SceneObject
 
 Floats = NDArray[np.float64]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from drake_clutter.cell.gripper import Payload
-from drake_clutter.planning.tool_kinematics import is_sideways, is_vertical
+from drake_clutter.planning.tool_kinematics import has_same_tilt, is_sideways, is_vertical
 
 Floats = NDArray[np.float64]
 
@@ -56,6 +56,14 @@ class GraspCandidate:
     def is_tilted(self) -> bool:
         """Whether the tool does not point down at the grasp or at the place pose."""
         return not (is_vertical(self.X_TG_pick) and is_vertical(self.X_TG_place))
+
+    @property
+    def level_axis(self) -> Floats | None:
+        """Axis in the tool that points down all the way; None if the tool turns. Shape (3,)."""
+        if not self.is_tilted:
+            return np.array([0.0, 0.0, 1.0])
+        is_level = has_same_tilt(self.X_TG_pick, self.X_TG_place)
+        return -self.X_TG_pick[2, :3] if is_level else None
 
 
 @dataclass(frozen=True)

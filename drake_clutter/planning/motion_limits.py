@@ -1,7 +1,7 @@
 """Limits of motions: check of a trajectory, and uniform scaling until all of them hold.
 
-Frames: B is the robot's base, F is the flange, Cm is the load's center of mass; C is a point that
-is fixed in F.
+Frames: T is the support, B is the robot's base, F is the flange, G is a tool, Cm is the load's
+center of mass; C is a point that is fixed in F.
 """
 
 import math
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_clutter.cell.gripper import Payload
+from drake_clutter.cell.payload_limits import payload_wrench
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.compilation import njit
 from drake_clutter.planning.arm_dynamics import arm_dynamics
@@ -90,7 +91,13 @@ class MotionLimits:
     dynamics: ChainDynamics
     p_FC: Floats
 
-    def __init__(self, cell: WorkCell, payload: Payload, max_tool_speed: float = math.inf) -> None:
+    def __init__(
+        self,
+        cell: WorkCell,
+        payload: Payload,
+        max_tool_speed: float = math.inf,
+        tilted_tool: str = "",
+    ) -> None:
         """Collect the limits.
 
         Args:
@@ -98,6 +105,8 @@ class MotionLimits:
             payload: Load of the gripper.
             max_tool_speed: Largest speed of the origin of any tool, if it is below that of the work
                 cell [m/s].
+            tilted_tool: Tool that holds the load and does not point down all the time: it has to
+                bear the load with gravity in its true direction, too. "" for any other motion.
         """
         self.robot = load_robot(cell.robot)
         self.payload = payload
@@ -105,6 +114,7 @@ class MotionLimits:
         self.dynamics = arm_dynamics(cell, payload)
         tools = [tool.X_FG.translation() for tool in cell.gripper.tools.values()]
         self.p_FC = np.array([payload.p_FCm, *tools])
+        self._tilted_load = TiltedLoad(cell, payload, tilted_tool) if tilted_tool else None
         n = self.robot.num_joints
         widths = {LimitKind.LOAD: 1, LimitKind.TOOL_SPEED: len(tools)}
         self._widths = [widths.get(kind, n) for kind in LimitKind]
@@ -136,7 +146,13 @@ class MotionLimits:
             self.max_tool_speed,
             values,
         )
-        return LimitRatios(values, np.repeat([*LimitKind], self._widths))
+        kinds = np.repeat([*LimitKind], self._widths)
+        if self._tilted_load is not None:
+            R_BF = robot.forward_kinematics(motion.q)[:, :3, :3]
+            ratios = self._tilted_load.ratios(R_BF, moved.accelerations[:, 0])
+            column = int(np.flatnonzero(kinds == LimitKind.LOAD)[0])
+            values[:, column] = np.maximum(values[:, column], ratios)
+        return LimitRatios(values, kinds)
 
     def find_violation(self, ratios: "LimitRatios") -> LimitViolation | None:
         """Return the limit that is exceeded most by more than `LIMIT_TOLERANCE`, if any."""
@@ -151,12 +167,57 @@ class MotionLimits:
         return LimitViolation(kind, "" if is_tool else self.robot.joint_names[joint], ratio)
 
 
+class TiltedLoad:
+    """Load of a tool, with gravity in its true direction."""
+
+    def __init__(self, cell: WorkCell, payload: Payload, tool: str) -> None:
+        """Take the load.
+
+        Args:
+            cell: Work cell with robot and gripper.
+            payload: The load.
+            tool: Name of the tool that holds it.
+        """
+        self._gripper, self._tool = cell.gripper, tool
+        X_FG = cell.gripper.tools[tool].X_FG
+        self._R_FG = X_FG.rotation().matrix()
+        self._mass = payload.mass
+        self._p_GCm = X_FG.inverse() @ np.array(payload.p_FCm)
+        self._down_B = -load_robot(cell.robot).X_TB.rotation().matrix()[2]
+
+    def ratios(self, R_BF: Floats, accelerations: Floats) -> Floats:
+        """Return the ratios of the load of a motion to what gravity leaves of the capacity.
+
+        Args:
+            R_BF: Orientations of the flange. Shape (m, 3, 3).
+            accelerations: Accelerations of the center of mass in B [m/s^2]. Shape (m, 3).
+
+        Returns:
+            Ratios; infinite where the tool does not hold the object at rest. Shape (m,).
+        """
+        R_BG = R_BF @ self._R_FG
+        down_G = self._down_B @ R_BG
+        moving = np.einsum("mi,mij->mj", accelerations, R_BG)
+        at_rest, in_motion = (
+            self._gripper.safety
+            * self._gripper.load_ratio(
+                self._tool, *payload_wrench(self._mass, self._p_GCm, down_G, acceleration)
+            )
+            for acceleration in (np.zeros_like(moving), moving)
+        )
+        reserve = 1 - at_rest
+        is_held = reserve > 0
+        ratios = np.full(len(at_rest), np.inf)
+        ratios[is_held] = (in_motion - at_rest)[is_held] / reserve[is_held]
+        return ratios
+
+
 @dataclass(frozen=True)
 class LimitRatios:
     """Ratios of a motion to its limits; a limit is exceeded above 1.
 
-    The ratio of a torque is that of its part without gravity to what gravity leaves of the limit;
-    it is infinite if gravity leaves nothing.
+    The ratio of a torque, and of a load in a tilted tool, is that of its part without gravity to
+    what gravity leaves of the limit; it is infinite if gravity leaves nothing.
 
     Attributes:
         values: Ratios. Shape (m, k).

@@ -25,10 +25,8 @@ from drake_clutter.planning.pick_place_plan import (
     TrajectorySegment,
 )
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.planning.segment_planner import (
-    CONTACT_TOLERANCE,
-    SegmentPlanner,
-)
+from drake_clutter.planning.segment_check import CONTACT_TOLERANCE, SegmentChecker
+from drake_clutter.planning.segment_planner import SegmentPlanner
 from drake_clutter.planning.side_grasps import distance_from_below
 from drake_clutter.planning.time_parameterization import min_travel_time
 from drake_clutter.planning.tool_kinematics import (
@@ -137,13 +135,26 @@ class PickPlaceSearch:
         self._X_TO_goal = X_TO_place = goal.X_TO_place or picked.X_TO
         self._X_TO = _to_matrix(rigid_transform(picked.X_TO))
         self._X_TO_place = _to_matrix(rigid_transform(X_TO_place))
+        self._poses_in_collision = set[tuple[str, bytes]]()
         self.num_attempts = 0
         self.failures = FailureLog()
+        self._checker = SegmentChecker(
+            cell,
+            config,
+            tools,
+            collision_model,
+            picked,
+            X_TO_place,
+            self.failures,
+            starts_at_rest=not self._is_held,
+            ends_at_rest=goal.releases,
+        )
         self._segments = SegmentPlanner(
             cell,
             config,
             tools,
             collision_model,
+            self._checker,
             picked,
             X_TO_place,
             None if self._is_held else self._start,
@@ -288,18 +299,26 @@ class PickPlaceSearch:
         return np.asarray(self._X_TO_place @ invert_pose(self._X_TO) @ X_TG)
 
     def _pick_endpoint(self, candidate: GraspCandidate) -> EndpointContext | None:
-        """Return the endpoint at the pick pose, or None if the arm is in collision there."""
+        """Return the endpoint at the pick pose, or None if the arm is in collision there.
+
+        Where the gripper is in collision, no other solution of inverse kinematics is tried.
+        """
         q = candidate.q_pick
-        self._segments.set_up_segment("approach", candidate)
+        pose = candidate.tool, candidate.X_TG_pick.tobytes()
+        if pose in self._poses_in_collision:
+            return None
+        self._checker.set_up_segment("approach", candidate)
         below = self._bodies_below(self._picked)
-        of_gripper = self._segments.distances_below_object(candidate, q, below)
+        of_gripper = self._checker.distances_below_object(candidate, q, below)
         context = EndpointContext(
             candidate.tool, candidate.X_TG_pick[:2, 3], of_gripper, candidate.load_distance
         )
-        if self._segments.min_distance_along(q[None], context, 1, "at the grasp") is None:
+        if self._checker.min_distance_along(q[None], context, 1, "at the grasp") is None:
+            if self._checker.is_tool_in_collision:
+                self._poses_in_collision.add(pose)
             return None
-        self._segments.set_up_segment("carry", candidate)
-        of_object = self._segments.contact_distances(candidate, q)
+        self._checker.set_up_segment("carry", candidate)
+        of_object = self._checker.contact_distances(candidate, q)
         return replace(context, allowed_distances=of_gripper | of_object)
 
     def _place_endpoint(self, candidate: GraspCandidate, q: Floats) -> EndpointContext | None:
@@ -307,18 +326,18 @@ class PickPlaceSearch:
 
         Only an object that is released may touch its neighbors.
         """
-        self._segments.set_up_segment("carry", candidate)
+        self._checker.set_up_segment("carry", candidate)
         below = self._bodies_below(replace(self._picked, X_TO=self._X_TO_goal))
-        of_gripper = self._segments.distances_below_object(candidate, q, below)
+        of_gripper = self._checker.distances_below_object(candidate, q, below)
         allowed = (
-            of_gripper | self._segments.contact_distances(candidate, q)
+            of_gripper | self._checker.contact_distances(candidate, q)
             if self._goal.releases
             else {}
         )
         context = EndpointContext(
             candidate.tool, candidate.X_TG_place[:2, 3], allowed, candidate.load_distance
         )
-        distance = self._segments.min_distance_along(q[None], context, 2, "at the place")
+        distance = self._checker.min_distance_along(q[None], context, 2, "at the place")
         return None if distance is None else context
 
     def _bodies_below(self, placed: SceneObject) -> frozenset[str]:
@@ -421,7 +440,7 @@ class PickPlaceSearch:
             )
             if isinstance(path, str):
                 break
-            shortfall = -self._segments.carry_columns(candidate).slack(path.waypoints)
+            shortfall = -self._checker.carry_columns(candidate).slack(path.waypoints)
             if shortfall <= 0:
                 break
             height += shortfall

@@ -18,34 +18,41 @@ collisions and scales it to the limits.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import BsplineBasis, KnotVectorType
 from pydrake.solvers import ClarabelSolver, MathematicalProgram, SolverOptions
-from pydrake.trajectories import BsplineTrajectory, Trajectory
-from scipy import sparse
-from scipy.linalg import null_space
+from pydrake.trajectories import Trajectory
 
 from drake_clutter.planning.cubic_spline import CubicSpline, clamped_knots
+from drake_clutter.planning.spline_program import (
+    BASIS_SPLINE,
+    DERIVATIVE_WEIGHTS,
+    NUM_COLLISION_SAMPLES,
+    NUM_CONTROL_POINTS,
+    NUM_FIXED_CONTROL_POINTS,
+    SAMPLE_PARAMETERS,
+    SECOND_DERIVATIVE_WEIGHTS,
+    SPLINE_ORDER,
+    VALUE_WEIGHTS,
+    ControlPointSubspaces,
+    LinearConstraints,
+    LinearizedDistances,
+    derivative_matrix,
+    directional_matrix,
+)
 from drake_clutter.robots.robot_model import RobotModel
 
 Floats = NDArray[np.float64]
 
-NUM_CONTROL_POINTS = 28
-"""Control points of the spline."""
 TRUST_REGION_RADII = (0.8, 0.4, 0.2)
 """Largest change of a control point in each subproblem [rad]."""
 LINEARIZED_TILT_RADII = (0.4, 0.2, 0.1, 0.05, 0.03)
 """Trust region radii where the tool is kept vertical by a linearized constraint [rad]."""
 REPAIR_FACTORS = (0.5, 0.25)
 """Trust region radii of the repairs of a trajectory, as fractions of the last radius."""
-NUM_COLLISION_SAMPLES = 50
-"""Points of the spline at which distances and tool speeds are imposed; tool accelerations at every
-second one."""
 CONVERGENCE_TOLERANCE = 0.02
 """Change of the control points [rad], and relative change of the duration, at convergence."""
 INFLUENCE_DISTANCE = 0.06
@@ -53,12 +60,11 @@ INFLUENCE_DISTANCE = 0.06
 MIN_AXIAL_TRAVEL = (0.0, 0.002)
 """Distances of the first free control points from the grasp and the place pose, on the axis of the
 tool there, if it holds nothing [m]: it leaves an object along its axis."""
+TOOL_AXIS = np.array([0.0, 0.0, 1.0])
+"""Axis of the tool in its own frame. Shape (3,)."""
 ENDPOINT_FRACTION = 0.15
 """Fraction of the path at either end where distances below the required ones are not increased: the
 fixed endpoints leave no freedom there."""
-NUM_FIXED_CONTROL_POINTS = 3
-"""Equal control points at either end: they give zero velocity and acceleration there."""
-_SPLINE_ORDER = 4
 _SMOOTHNESS_WEIGHT = 1e-4
 """Weight of the squared accelerations relative to T^2. It selects the smoothest of the trajectories
 with nearly minimal duration."""
@@ -69,55 +75,12 @@ _MAX_TANGENT_CHANGE = 0.25
 """Relative change of the duration up to which the tangents change its optimum by less than 1 %."""
 _MAX_DISTANCE_ERROR = 0.001
 """Shortfall of distances [m] that is less than the margin which the caller adds to them."""
-_RANK_TOLERANCE = 1e-9
-"""Relative size of singular values of equality constraints that count as zero."""
 _SOLVER_OPTIONS = SolverOptions()
 """Tolerances of the subproblems [rad]: those of the limits and distances are larger."""
 for _name in ("tol_gap_abs", "tol_gap_rel", "tol_feas"):
     _SOLVER_OPTIONS.SetOption(ClarabelSolver.id(), _name, 1e-5)
 _MIN_DURATION = 0.05
 """Lower bound of the duration [s]; keeps the subproblems well conditioned."""
-_BASIS = BsplineBasis(_SPLINE_ORDER, NUM_CONTROL_POINTS, KnotVectorType.kClampedUniform, 0.0, 1.0)
-_BASIS_SPLINE = BsplineTrajectory(_BASIS, np.eye(NUM_CONTROL_POINTS))
-"""Spline whose values are the basis functions."""
-_SAMPLE_PARAMETERS = np.linspace(0.0, 1.0, NUM_COLLISION_SAMPLES + 2)[1:-1]
-"""Parameters s of the samples. Shape (NUM_COLLISION_SAMPLES,)."""
-_VALUE_WEIGHTS = _BASIS_SPLINE.vector_values(_SAMPLE_PARAMETERS).T
-"""Maps control points to values at the samples. Shape (NUM_COLLISION_SAMPLES, 28)."""
-_DERIVATIVE_WEIGHTS = _BASIS_SPLINE.MakeDerivative(1).vector_values(_SAMPLE_PARAMETERS).T
-"""Maps control points to derivatives at the samples. Shape (NUM_COLLISION_SAMPLES, 28)."""
-_SECOND_DERIVATIVE_WEIGHTS = _BASIS_SPLINE.MakeDerivative(2).vector_values(_SAMPLE_PARAMETERS).T
-"""Maps control points to second derivatives at the samples. Shape (NUM_COLLISION_SAMPLES, 28)."""
-
-
-@lru_cache(maxsize=16)
-def _derivative_matrix(order: int, num_joints: int) -> sparse.csr_matrix:
-    """Return the matrix from all control points to the control points of a derivative.
-
-    Args:
-        order: Order of the derivative.
-        num_joints: Number of joints, n.
-
-    Returns:
-        Sparse matrix; control points are flattened row by row. Shape ((28 - order) n, 28 n).
-    """
-    one_joint = np.array(_BASIS_SPLINE.MakeDerivative(order).control_points())[..., 0]
-    return sparse.csr_matrix(np.kron(one_joint, np.eye(num_joints)))
-
-
-@dataclass(frozen=True)
-class LinearizedDistances:
-    """First-order models of signed distances at configurations of a path.
-
-    Attributes:
-        rows: Indices of the configurations. Shape (k,).
-        gradients: Derivatives by the joint positions [m/rad]. Shape (k, n).
-        slack: Distances minus required distances [m]. Shape (k,).
-    """
-
-    rows: NDArray[np.int64]
-    gradients: Floats
-    slack: Floats
 
 
 @dataclass(frozen=True)
@@ -127,10 +90,13 @@ class TrajectoryOptimizationProblem:
     Attributes:
         initial_trajectory: Collision-free, time-parameterized initial guess.
         robot: Robot with its joint limits.
-        departure_distances: Least distances from the start of the first free control points, which
-            are on the axis of the tool there [m]; empty if it may move in any direction.
+        departure_distances: Least distances from the start of the first free control points, on a
+            straight line from there [m]; empty if the tool may move in any direction.
         arrival_distances: Likewise from the end, for the last free control points [m].
-        keep_tool_vertical: Whether the tool axis stays vertical.
+        departure_directions: Directions of these lines in T, at the start and at the end. Shapes
+            (3,).
+        level_axis: Axis in the tool that keeps pointing down; None if the tool may tilt. Shape
+            (3,).
         max_tool_speed: Largest speed of the tool [m/s]; infinite without a limit.
         max_tool_acceleration: Largest acceleration of the tool along each axis [m/s^2].
         nearby_distances: Returns all distances below the influence distance, from joint positions
@@ -140,21 +106,33 @@ class TrajectoryOptimizationProblem:
             ends of the path, but for its parts on the axes. None without an object.
         tool_jacobians: Returns the spatial Jacobians of the tool, angular rows first, shape
             (m, 6, n), from joint positions of shape (m, n).
-        tool_axis: Returns the z axes of the tool in T, shape (m, 3), from joint positions of shape
-            (m, n).
+        tool_rotations: Returns the orientations of the tool in T, shape (m, 3, 3), from joint
+            positions of shape (m, n).
     """
 
     initial_trajectory: Trajectory
     robot: RobotModel
     departure_distances: tuple[float, ...]
     arrival_distances: tuple[float, ...]
-    keep_tool_vertical: bool
+    departure_directions: tuple[Floats, Floats]
+    level_axis: Floats | None
     max_tool_speed: float
     max_tool_acceleration: float
     nearby_distances: Callable[[Floats, Floats], LinearizedDistances]
     column_distances: Callable[[Floats], LinearizedDistances] | None
     tool_jacobians: Callable[[Floats], Floats]
-    tool_axis: Callable[[Floats], Floats]
+    tool_rotations: Callable[[Floats], Floats]
+
+    @property
+    def holds_load(self) -> bool:
+        """Whether the tool holds an object."""
+        return math.isfinite(self.max_tool_acceleration)
+
+    @property
+    def level_rows(self) -> Floats | None:
+        """Rows that keep the tool level exactly, see `RobotModel.vertical_tool_rows`."""
+        is_vertical = self.level_axis is not None and np.array_equal(self.level_axis, TOOL_AXIS)
+        return self.robot.vertical_tool_rows if is_vertical else None
 
 
 def optimize_trajectory(problem: TrajectoryOptimizationProblem) -> Iterator[CubicSpline]:
@@ -169,8 +147,8 @@ def optimize_trajectory(problem: TrajectoryOptimizationProblem) -> Iterator[Cubi
     initial_duration = problem.initial_trajectory.end_time()
     points = _fit_control_points(problem.initial_trajectory)
     # The path of a held object has no tangents of the tool's limits at another duration.
-    duration = initial_duration * (1.0 if problem.keep_tool_vertical else _EXPECTED_GAIN)
-    is_exact = not problem.keep_tool_vertical or problem.robot.vertical_tool_rows is not None
+    duration = initial_duration * (1.0 if problem.holds_load else _EXPECTED_GAIN)
+    is_exact = problem.level_axis is None or problem.level_rows is not None
     radii = TRUST_REGION_RADII if is_exact else LINEARIZED_TILT_RADII
     repair_radii = [factor * radii[-1] for factor in REPAIR_FACTORS]
     has_converged = False
@@ -205,7 +183,7 @@ def _shortest_duration(points: Floats, robot: RobotModel) -> float:
     limits = (robot.velocity_limits, robot.acceleration_limits, robot.jerk_limits)
     durations = list[float]()
     for order, limit in enumerate(limits, start=1):
-        derivatives = _derivative_matrix(order, robot.num_joints) @ points.ravel()
+        derivatives = derivative_matrix(order, robot.num_joints) @ points.ravel()
         ratio = float(np.abs(derivatives.reshape(-1, robot.num_joints) / limit).max())
         durations.append(ratio ** (1.0 / order))
     return max(durations)
@@ -221,14 +199,10 @@ def _is_nearly_optimal(problem: TrajectoryOptimizationProblem, points: Floats) -
         problem: Trajectory optimization problem.
         points: Solution of a subproblem. Shape (28, n).
     """
-    if (
-        problem.keep_tool_vertical
-        or math.isfinite(problem.max_tool_speed)
-        or math.isfinite(problem.max_tool_acceleration)
-    ):
+    if problem.holds_load or math.isfinite(problem.max_tool_speed):
         return False
-    nearby = problem.nearby_distances(_VALUE_WEIGHTS @ points, _SAMPLE_PARAMETERS)
-    s = _SAMPLE_PARAMETERS[nearby.rows]
+    nearby = problem.nearby_distances(VALUE_WEIGHTS @ points, SAMPLE_PARAMETERS)
+    s = SAMPLE_PARAMETERS[nearby.rows]
     is_free = np.minimum(s, 1 - s) >= ENDPOINT_FRACTION
     return bool((nearby.slack[is_free] > -_MAX_DISTANCE_ERROR).all())
 
@@ -238,7 +212,7 @@ def _fit_control_points(trajectory: Trajectory) -> Floats:
     num_fixed = NUM_FIXED_CONTROL_POINTS
     s = np.linspace(0.0, 1.0, 120)
     q = trajectory.vector_values(s * trajectory.end_time()).T
-    B = _BASIS_SPLINE.vector_values(s).T
+    B = BASIS_SPLINE.vector_values(s).T
     points = np.empty((NUM_CONTROL_POINTS, q.shape[1]))
     points[:num_fixed] = q[0]
     points[-num_fixed:] = q[-1]
@@ -249,143 +223,17 @@ def _fit_control_points(trajectory: Trajectory) -> Floats:
     return points
 
 
-class _ControlPointSubspaces:
-    """Affine subspaces of the control points in which equality constraints hold.
-
-    The control points are p = p_0 + N y. Most variables are eliminated by this: the solver takes
-    half the time that it takes with equality constraints.
-    """
-
-    def __init__(self, points: Floats) -> None:
-        """Start with all control points free but the fixed ones.
-
-        Args:
-            points: Previous control points. Shape (28, n).
-        """
-        self._points = points.copy()
-        n = points.shape[1]
-        num_free = NUM_CONTROL_POINTS - 2 * NUM_FIXED_CONTROL_POINTS
-        fixed = [np.zeros((n, 0))] * NUM_FIXED_CONTROL_POINTS
-        self._bases = [*fixed, *([np.eye(n)] * num_free), *fixed]
-
-    def constrain(self, indices: Sequence[int], A: Floats, b: Floats) -> None:
-        """Add A q = b for free control points that have no constraint yet.
-
-        Args:
-            indices: Indices of the control points.
-            A: Coefficients. Shape (m, n).
-            b: Right-hand side. Shape (m,).
-        """
-        basis, inverse = null_space(A, rcond=_RANK_TOLERANCE), np.linalg.pinv(A)
-        for index in indices:
-            q = self._points[index]
-            q += inverse @ (b - A @ q)
-            self._bases[index] = basis
-
-    @property
-    def offset(self) -> Floats:
-        """Offset p_0, flattened row by row. Shape (28 n,)."""
-        return self._points.ravel()
-
-    @property
-    def basis(self) -> sparse.csr_matrix:
-        """Basis N. Shape (28 n, k)."""
-        rows, columns = np.cumsum([(0, 0), *(basis.shape for basis in self._bases)], axis=0).T
-        basis = np.zeros((rows[-1], columns[-1]))
-        for k, of_point in enumerate(self._bases):
-            basis[rows[k] : rows[k + 1], columns[k] : columns[k + 1]] = of_point
-        return sparse.csr_matrix(basis)
-
-
-class _LinearConstraints:
-    """Linear inequalities of the control points p, flattened row by row, and T^2."""
-
-    def __init__(self) -> None:
-        self._A_points = list[sparse.csr_matrix]()
-        self._A_square = list[Floats]()
-        self._b = list[Floats]()
-
-    def add(self, A_points: sparse.csr_matrix, A_square: Floats, b: Floats) -> None:
-        """Add A_points p + A_square T^2 <= b.
-
-        Args:
-            A_points: Coefficients of p. Shape (m, 28 n).
-            A_square: Coefficients of T^2. Shape (m,).
-            b: Upper bounds. Shape (m,).
-        """
-        self._A_points.append(A_points)
-        self._A_square.append(A_square)
-        self._b.append(b)
-
-    def add_two_sided(
-        self, A_points: sparse.csr_matrix, bound: Floats, b: Floats | None = None
-    ) -> None:
-        """Add -bound T^2 - b <= A_points p <= bound T^2 + b.
-
-        Args:
-            A_points: Coefficients of p. Shape (m, 28 n).
-            bound: Coefficients of T^2. Shape (m,).
-            b: Constant bounds; None for 0. Shape (m,).
-        """
-        for sign in (1, -1):
-            self.add(sign * A_points, -bound, np.zeros_like(bound) if b is None else b)
-
-    def add_distances(self, distances: LinearizedDistances, q: Floats) -> None:
-        """Add that distances at samples of the spline are not below the required ones.
-
-        Args:
-            distances: Distances, linearized at the previous solution.
-            q: Samples of that solution. Shape (NUM_COLLISION_SAMPLES, n).
-        """
-        index, gradients = distances.rows, distances.gradients
-        if not len(index):
-            return
-        self.add(
-            _directional_matrix(-_VALUE_WEIGHTS[index], gradients),
-            np.zeros(len(index)),
-            distances.slack - (gradients * q[index]).sum(axis=1),
-        )
-
-    def add_to(
-        self, prog: MathematicalProgram, subspaces: _ControlPointSubspaces, x: NDArray[np.object_]
-    ) -> None:
-        """Add the constraints to a program with the variables x = (y, T^2)."""
-        A_points = sparse.vstack(self._A_points, format="csr")
-        A_y = A_points @ subspaces.basis
-        b = np.concatenate(self._b) - A_points @ subspaces.offset
-        # Rows of fixed control points alone hold at any solution, but for rounding.
-        is_kept = np.diff(A_y.indptr) > 0
-        A_square = sparse.csr_matrix(np.concatenate(self._A_square)[is_kept, None])
-        A = sparse.hstack([A_y[is_kept], A_square], format="csc")
-        prog.AddLinearConstraint(A, np.full(A.shape[0], -np.inf), b[is_kept], x)
-
-
-def _directional_matrix(weights: Floats, directions: Floats) -> sparse.csr_matrix:
-    """Return the matrix from control points to components of spline values.
-
-    Args:
-        weights: Weights of the control points in each value. Shape (m, 28).
-        directions: Direction of each component. Shape (m, n).
-
-    Returns:
-        Sparse matrix. Shape (m, 28 n).
-    """
-    return sparse.csr_matrix(
-        (weights[:, :, None] * directions[:, None, :]).reshape(len(weights), -1)
-    )
-
-
 def _is_axial(problem: TrajectoryOptimizationProblem) -> NDArray[np.bool_]:
     """Return which samples are on the axes of the tool at the ends. Shape (m,)."""
-    num_spans = NUM_CONTROL_POINTS - _SPLINE_ORDER + 1
-    spans = _SAMPLE_PARAMETERS * num_spans
+    num_spans = NUM_CONTROL_POINTS - SPLINE_ORDER + 1
+    spans = SAMPLE_PARAMETERS * num_spans
     num_start, num_end = len(problem.departure_distances), len(problem.arrival_distances)
     return np.asarray((spans < num_start) | (num_spans - spans < num_end))
 
 
 def _limit_constraints(
     problem: TrajectoryOptimizationProblem, points: Floats, duration: float
-) -> _LinearConstraints:
+) -> LinearConstraints:
     """Return limits and distance constraints, linearized at a spline.
 
     Args:
@@ -393,27 +241,27 @@ def _limit_constraints(
         points: Control points. Shape (28, n).
         duration: Duration T [s].
     """
-    constraints = _LinearConstraints()
-    q = _VALUE_WEIGHTS @ points
+    constraints = LinearConstraints()
+    q = VALUE_WEIGHTS @ points
     robot = problem.robot
     n = robot.num_joints
     speeds = np.tile(robot.velocity_limits, NUM_CONTROL_POINTS - 1)
     accelerations = np.tile(robot.acceleration_limits, NUM_CONTROL_POINTS - 2)
     # T is at most the tangent of sqrt(T^2): T^2 / (2 T_previous) + T_previous / 2.
     constraints.add_two_sided(
-        _derivative_matrix(1, n), speeds / (2 * duration), speeds * duration / 2
+        derivative_matrix(1, n), speeds / (2 * duration), speeds * duration / 2
     )
-    constraints.add_two_sided(_derivative_matrix(2, n), accelerations)
+    constraints.add_two_sided(derivative_matrix(2, n), accelerations)
     if np.isfinite(robot.jerk_limits).all():
         # T^3 is at least the tangent of (T^2)^1.5: 1.5 T_previous T^2 - T_previous^3 / 2.
         jerks = np.tile(robot.jerk_limits, NUM_CONTROL_POINTS - 3)
         constraints.add_two_sided(
-            _derivative_matrix(3, n), 1.5 * duration * jerks, -jerks * duration**3 / 2
+            derivative_matrix(3, n), 1.5 * duration * jerks, -jerks * duration**3 / 2
         )
-    nearby = problem.nearby_distances(q, _SAMPLE_PARAMETERS)
+    nearby = problem.nearby_distances(q, SAMPLE_PARAMETERS)
     if len(nearby.rows):
         index, gradients = nearby.rows, nearby.gradients
-        is_near_end = np.minimum(_SAMPLE_PARAMETERS, 1 - _SAMPLE_PARAMETERS) < ENDPOINT_FRACTION
+        is_near_end = np.minimum(SAMPLE_PARAMETERS, 1 - SAMPLE_PARAMETERS) < ENDPOINT_FRACTION
         slack = np.where(is_near_end[index], np.maximum(nearby.slack, 0.0), nearby.slack)
         constraints.add_distances(LinearizedDistances(index, gradients, slack), q)
     if problem.column_distances is not None:
@@ -425,11 +273,11 @@ def _limit_constraints(
         constraints.add_distances(kept, q)
     if math.isfinite(problem.max_tool_speed):
         J = problem.tool_jacobians(q)[:, 3:]
-        velocities = (J @ (_DERIVATIVE_WEIGHTS @ points)[:, :, None])[:, :, 0]
+        velocities = (J @ (DERIVATIVE_WEIGHTS @ points)[:, :, None])[:, :, 0]
         directions = velocities / np.maximum(np.linalg.norm(velocities, axis=1), 1e-9)[:, None]
         speed = np.full(len(q), problem.max_tool_speed)
         constraints.add(
-            _directional_matrix(_DERIVATIVE_WEIGHTS, (directions[:, None] @ J)[:, 0]),
+            directional_matrix(DERIVATIVE_WEIGHTS, (directions[:, None] @ J)[:, 0]),
             -speed / (2 * duration),
             speed * duration / 2,
         )
@@ -437,37 +285,40 @@ def _limit_constraints(
         index = np.repeat(np.arange(0, NUM_COLLISION_SAMPLES, 2), 3)
         J = problem.tool_jacobians(q[::2])[:, 3:].reshape(-1, n)
         constraints.add_two_sided(
-            _directional_matrix(_SECOND_DERIVATIVE_WEIGHTS[index], J),
+            directional_matrix(SECOND_DERIVATIVE_WEIGHTS[index], J),
             np.full(len(index), problem.max_tool_acceleration),
         )
     return constraints
 
 
-def _add_vertical_tool_constraints(
+def _add_level_constraints(
     problem: TrajectoryOptimizationProblem,
+    level_axis: Floats,
     points: Floats,
-    subspaces: _ControlPointSubspaces,
+    subspaces: ControlPointSubspaces,
 ) -> None:
-    """Add the constraint that the tool stays vertical.
+    """Add the constraint that an axis of the tool keeps pointing down.
 
-    It is exact for robots with `vertical_tool_rows`. For other robots it is linearized at the
-    previous control points, except for those at the ends that are fixed or on a vertical line.
+    It is exact for robots with `vertical_tool_rows` and a vertical tool. Else it is linearized at
+    the previous control points, except for those at the ends that are fixed or on a straight line.
 
     Args:
         problem: Trajectory optimization problem.
+        level_axis: The axis in the tool. Shape (3,).
         points: Previous control points. Shape (28, n).
         subspaces: Subspaces to which the constraint is added.
     """
-    rows = problem.robot.vertical_tool_rows
+    rows = problem.level_rows
     start = NUM_FIXED_CONTROL_POINTS + len(problem.departure_distances)
     end = NUM_CONTROL_POINTS - NUM_FIXED_CONTROL_POINTS - len(problem.arrival_distances)
     if rows is not None:
         subspaces.constrain(range(start, end), rows, rows @ points[0])
         return
-    axes, jacobians = problem.tool_axis(points), problem.tool_jacobians(points)
+    axes = problem.tool_rotations(points) @ level_axis
+    jacobians = problem.tool_jacobians(points)
     for k in range(start, end):
         (x, y, z), J_rotation = axes[k], jacobians[k, :3]
-        # Derivatives of x and y of the tool axis: the first two rows of w x axis.
+        # Derivatives of x and y of the axis in T: the first two rows of w x axis.
         tilts = np.array(
             [z * J_rotation[1] - y * J_rotation[2], x * J_rotation[2] - z * J_rotation[0]]
         )
@@ -484,10 +335,10 @@ def _basis_with(axis: Floats) -> Floats:
 def _add_departure_constraints(
     problem: TrajectoryOptimizationProblem,
     points: Floats,
-    subspaces: _ControlPointSubspaces,
-    constraints: _LinearConstraints,
+    subspaces: ControlPointSubspaces,
+    constraints: LinearConstraints,
 ) -> None:
-    """Add the constraint that the tool moves along its axis at the start and at the end.
+    """Add the constraint that the tool moves on straight lines at the start and at the end.
 
     Args:
         problem: Trajectory optimization problem.
@@ -495,20 +346,24 @@ def _add_departure_constraints(
         subspaces: Subspaces to which equality constraints are added.
         constraints: Constraints to which inequalities are added.
     """
-    for heights, end, inwards in (
-        (problem.departure_distances, 0, 1),
-        (problem.arrival_distances, NUM_CONTROL_POINTS - 1, -1),
+    for heights, end, inwards, away in (
+        (problem.departure_distances, 0, 1, problem.departure_directions[0]),
+        (
+            problem.arrival_distances,
+            NUM_CONTROL_POINTS - 1,
+            -1,
+            problem.departure_directions[1],
+        ),
     ):
         if not heights:
             continue
         q = points[end]
         (J,) = problem.tool_jacobians(q[None])
-        away = -problem.tool_axis(q[None])[0]
         J = np.vstack([J[:3], _basis_with(away) @ J[3:]])
         indices = end + inwards * (NUM_FIXED_CONTROL_POINTS + np.arange(len(heights)))
         subspaces.constrain(indices.tolist(), J[:5], J[:5] @ q)
         constraints.add(
-            _directional_matrix(-np.eye(NUM_CONTROL_POINTS)[indices], J[5:]),
+            directional_matrix(-np.eye(NUM_CONTROL_POINTS)[indices], J[5:]),
             np.zeros(len(heights)),
             -J[5] @ q - np.array(heights),
         )
@@ -532,11 +387,11 @@ def _solve_subproblem(
         New control points, shape (28, n), and duration [s]; None if the subproblem is infeasible.
     """
     n = problem.robot.num_joints
-    subspaces = _ControlPointSubspaces(points)
+    subspaces = ControlPointSubspaces(points)
     constraints = _limit_constraints(problem, points, duration)
     _add_departure_constraints(problem, points, subspaces, constraints)
-    if problem.keep_tool_vertical:
-        _add_vertical_tool_constraints(problem, points, subspaces)
+    if problem.level_axis is not None:
+        _add_level_constraints(problem, problem.level_axis, points, subspaces)
     N, p_0 = subspaces.basis, subspaces.offset
     prog = MathematicalProgram()
     x = prog.NewContinuousVariables(N.shape[1] + 1)
@@ -550,7 +405,7 @@ def _solve_subproblem(
     prog.AddLinearCost([1 / duration**2], 0.0, x[-1:])
     limits = np.tile(problem.robot.acceleration_limits, NUM_CONTROL_POINTS - 2) * duration**2
     # Accelerations of y and of p_0, relative to the limits.
-    D = _derivative_matrix(2, n)
+    D = derivative_matrix(2, n)
     of_y, of_offset = (D @ N).toarray() / limits[:, None], (D @ p_0) / limits
     prog.AddQuadraticCost(
         2 * _SMOOTHNESS_WEIGHT * of_y.T @ of_y,
