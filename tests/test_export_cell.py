@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import DEFAULT_CELL, resting, scene_of
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyForces, RigidBody
 from pydrake.systems.framework import Context, DiagramBuilder
@@ -217,6 +218,13 @@ def test_arm_rests_at_home(tmp_path: Path) -> None:
     look = -data.camera("overhead").xmat.reshape(3, 3)[:, 2]
     assert look == pytest.approx([0, 0, -1], abs=1e-9)
     assert data.camera("overhead").xpos == pytest.approx([0, 0, 1.6])
+    X_TF = RigidTransform(RotationMatrix(data.site("robot/flange").xmat.reshape(3, 3)))
+    X_TF.set_translation(data.site("robot/flange").xpos)
+    X_TC = X_TF @ DEFAULT_CELL.wrist_camera.pose.transform
+    wrist = data.camera("robot/wrist")
+    assert wrist.xpos == pytest.approx(X_TC.translation(), abs=1e-9)
+    assert -wrist.xmat.reshape(3, 3)[:, 2] == pytest.approx(X_TC.rotation().matrix()[:, 2])
+    assert -wrist.xmat.reshape(3, 3)[:, 1] == pytest.approx(X_TC.rotation().matrix()[:, 1])
 
 
 def test_only_some_formats_hold_a_cell(tmp_path: Path) -> None:

@@ -117,6 +117,10 @@ def test_joints_have_limits_and_drives(tmp_path: Path) -> None:
     fov = camera.GetFieldOfView(camera.FOVVertical)
     assert fov == pytest.approx(cell.camera.fov_y_deg, abs=1e-4)
     assert list(camera.frustum.ComputeViewDirection()) == pytest.approx([0, 0, -1])
+    X_TC = pose_of(stage.GetPrimAtPath(f"{ARM}/robot/wrist_3/camera_wrist"))
+    flange = pose_of(stage.GetPrimAtPath(f"{ARM}/robot/wrist_3/frame_flange"))
+    X_FC = flange.inverse() @ X_TC @ RigidTransform(RotationMatrix.MakeXRotation(math.pi))
+    assert X_FC.IsNearlyEqualTo(cell.wrist_camera.pose.transform, 1e-9)
 
 
 def test_objects_are_rigid_bodies(tmp_path: Path) -> None:

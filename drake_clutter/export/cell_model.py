@@ -28,6 +28,7 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Context, DiagramBuilder
 
+from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.export.model_parts import Inertial
 from drake_clutter.simulation.cell_plant import (
@@ -163,6 +164,23 @@ class CellFrame:
 
 
 @dataclass(frozen=True)
+class CellCamera:
+    """Camera on a body or in the world.
+
+    Attributes:
+        name: Unique name.
+        camera: Image size and field of view.
+        body: Name of the body; "" for the world.
+        X_BC: Pose in the body.
+    """
+
+    name: str
+    camera: Camera
+    body: str
+    X_BC: RigidTransform
+
+
+@dataclass(frozen=True)
 class JointCoupling:
     """Position of a joint as a multiple of that of another one, plus an offset.
 
@@ -184,16 +202,16 @@ class CellModel:
     """A work cell without its support.
 
     Attributes:
-        cell: The cell, for its cameras.
         bodies: Bodies, parents first.
         frames: Flange `robot/FRAME` and tools `gripper/TOOL`.
+        cameras: Cameras of the cell, and `robot/wrist` on the flange.
         couplings: Couplings of joints.
         excluded: Pairs of bodies, by name, that never collide, and of which one can move.
     """
 
-    cell: WorkCell
     bodies: tuple[CellBody, ...]
     frames: tuple[CellFrame, ...]
+    cameras: tuple[CellCamera, ...]
     couplings: tuple[JointCoupling, ...]
     excluded: tuple[tuple[str, str], ...]
 
@@ -255,13 +273,19 @@ class _CellReader:
         flange = self._arm.flange
         frames = {f"robot/{flange.name()}": flange}
         frames |= {f"gripper/{name}": frame for name, frame in self._arm.tools.items()}
+        cameras = [
+            CellCamera(name, camera, "", camera.X_TC) for name, camera in self._cell.cameras.items()
+        ]
+        wrist = self._cell.wrist_camera
+        X_BC = flange.GetFixedPoseInBodyFrame() @ wrist.pose.transform  # of which X_FC is the pose
+        cameras.append(CellCamera("robot/wrist", wrist, self._body_name(flange.body()), X_BC))
         return CellModel(
-            cell=self._cell,
             bodies=bodies,
             frames=tuple(
                 CellFrame(name, self._body_name(frame.body()), frame.GetFixedPoseInBodyFrame())
                 for name, frame in frames.items()
             ),
+            cameras=tuple(cameras),
             couplings=_read_couplings(
                 self._cell.gripper.model_sdf(compliant=True, actuated=True), "gripper/"
             ),

@@ -8,8 +8,7 @@ from xml.etree.ElementTree import Element, SubElement
 from pydrake.geometry import Box, Capsule, Convex, Cylinder, Ellipsoid, Mesh, Shape, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 
-from drake_clutter.cell.camera import Camera
-from drake_clutter.export.cell_model import CellBody, CellJoint, CellModel
+from drake_clutter.export.cell_model import CellBody, CellCamera, CellJoint, CellModel
 from drake_clutter.export.model_parts import format_numbers, write_shape_mesh
 
 _MESH_FOLDER = "cell_meshes"
@@ -46,8 +45,8 @@ class CellWriter:
         for frame in self._model.frames:
             attributes = {"name": frame.name} | _pose_attributes(frame.X_BF)
             SubElement(elements[frame.body], "site", attributes)
-        for name, camera in self._model.cell.cameras.items():
-            _add_camera(worldbody, name, camera)
+        for camera in self._model.cameras:
+            _add_camera(elements[camera.body], camera)
         contact = SubElement(self._root, "contact")
         for first, second in self._model.excluded:
             SubElement(contact, "exclude", body1=first, body2=second)
@@ -97,7 +96,7 @@ class CellWriter:
 
     def _add_visual_size(self) -> None:
         """Make the buffer of offscreen rendering as large as the largest image."""
-        cameras = self._model.cell.cameras.values()
+        cameras = [entry.camera for entry in self._model.cameras]
         visual = SubElement(self._root, "visual")
         SubElement(
             visual,
@@ -210,11 +209,11 @@ def _add_joint(body: Element, joint: CellJoint) -> None:
         element.set("springref", repr(position))
 
 
-def _add_camera(worldbody: Element, name: str, camera: Camera) -> None:
+def _add_camera(body: Element, camera: CellCamera) -> None:
     attributes = {
-        "name": name,
-        "fovy": repr(camera.fov_y_deg),
-        "resolution": f"{camera.width} {camera.height}",
+        "name": camera.name,
+        "fovy": repr(camera.camera.fov_y_deg),
+        "resolution": f"{camera.camera.width} {camera.camera.height}",
     }
-    X_TM = camera.X_TC @ RigidTransform(_R_CAMERA)
-    SubElement(worldbody, "camera", attributes | _pose_attributes(X_TM))
+    X_BM = camera.X_BC @ RigidTransform(_R_CAMERA)
+    SubElement(body, "camera", attributes | _pose_attributes(X_BM))

@@ -28,11 +28,16 @@ from scipy.spatial.transform import Rotation
 from drake_clutter.assets.contact_properties import SURFACE_FRICTION
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.catalog import Shape as ObjectShape
-from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.payload_limits import GRAVITY
 from drake_clutter.cell.support import Support
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.export.cell_model import CellBody, CellJoint, CellModel, read_cell_model
+from drake_clutter.export.cell_model import (
+    CellBody,
+    CellCamera,
+    CellJoint,
+    CellModel,
+    read_cell_model,
+)
 from drake_clutter.export.model_parts import (
     Inertial,
     classes_in_scene,
@@ -192,9 +197,11 @@ class _StageWriter:
         for first, second in model.excluded:
             pairs = UsdPhysics.FilteredPairsAPI.Apply(prims[first])
             pairs.CreateFilteredPairsRel().AddTarget(prims[second].GetPath())
-        cameras = self._scope(self._root, "cameras")
-        for name, camera in model.cell.cameras.items():
-            _define_camera(self.stage, self._new_path(cameras, name), camera)
+        scope = self._scope(self._root, "cameras")
+        for camera in model.cameras:
+            parent = prims[camera.body].GetPath() if camera.body else scope
+            name = camera.name.replace("robot/", "camera_")
+            _define_camera(self.stage, self._new_path(parent, name), camera)
 
     def _scope(self, parent: Sdf.Path, name: str) -> Sdf.Path:
         """Return the path of a frame that only groups prims; it is added once."""
@@ -377,11 +384,12 @@ def _define_mesh(stage: Usd.Stage, path: Sdf.Path, mesh: Any) -> UsdGeom.Mesh:
     return geometry
 
 
-def _define_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera) -> None:
+def _define_camera(stage: Usd.Stage, path: Sdf.Path, camera: CellCamera) -> None:
     """Define a pinhole camera."""
     prim = UsdGeom.Camera.Define(stage, path)
-    _set_pose(prim, camera.X_TC @ RigidTransform(_R_CAMERA))
+    _set_pose(prim, camera.X_BC @ RigidTransform(_R_CAMERA))
+    width, height = camera.camera.width, camera.camera.height
     prim.CreateVerticalApertureAttr(_VERTICAL_APERTURE)
-    prim.CreateHorizontalApertureAttr(_VERTICAL_APERTURE * camera.width / camera.height)
-    prim.CreateFocalLengthAttr(_VERTICAL_APERTURE * camera.focal_length / camera.height)
+    prim.CreateHorizontalApertureAttr(_VERTICAL_APERTURE * width / height)
+    prim.CreateFocalLengthAttr(_VERTICAL_APERTURE * camera.camera.focal_length / height)
     prim.CreateClippingRangeAttr(Gf.Vec2f(0.01, 100.0))
