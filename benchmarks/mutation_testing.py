@@ -133,6 +133,8 @@ TESTS = (
     "carry_clearance",
     "planner_robots",
     "pick_place_planner",
+    "pick_place_search",
+    "trajectory_optimization",
 )
 """Test files that reach these modules in their own process."""
 TESTS_OF_COMPILED_CODE = (

@@ -82,6 +82,25 @@ def test_a_turned_box_is_beside_a_column_at_the_distance_of_its_nearest_corner()
     assert found.points[0, 0] == pytest.approx(p[0] - reach)
 
 
+def test_a_turned_and_tilted_box_is_beside_a_column_by_the_distance_of_their_sides() -> None:
+    """A square column and a cube with vertical sides at 45 deg that is tilted by 40 deg.
+
+    Seen from above, the tilted cube is a rectangle with half sides a and a (cos 40 + sin 40).
+    """
+    a, side, angle = 0.05, 0.1, np.radians(40)
+    cube = replace(BOX.object_class, size=(2 * a, 2 * a, 2 * a))
+    R = RollPitchYaw(0.0, angle, np.pi / 4).ToRotationMatrix()
+    n = np.sqrt(0.5)
+    X_TG = np.array([RigidTransform(R @ DOWN, [0.3 * n, 0.3 * n, 0.3]).GetAsMatrix4()])
+    box = CarriedBox.along(cube, GRASP, X_TG)
+    anchors = np.zeros((1, 2, 3))
+    column = Column(np.zeros(2), np.eye(2), np.full(2, side / 2), 1.0, anchors)
+    found = column.slack(box, 0.0, 0.0)
+    reach = a * (np.cos(angle) + np.sin(angle))
+    assert found.values == pytest.approx([0.3 - side / 2 * np.sqrt(2) - reach])
+    assert found.directions[0] == pytest.approx([n, n, 0.0])
+
+
 def test_the_clearance_grows_with_the_distance_from_the_axis_of_the_tool() -> None:
     x, y, z = BOX.X_TO.translation
     values = slack([(x, y, z), (x + 0.0005, y, z), (x, y - 0.002, z)], max_drift=0.001)

@@ -2,6 +2,7 @@
 
 import math
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +24,8 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from drake_clutter.cell.fixture import Fixture
+from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.planning.collision_model import CollisionModel
 from drake_clutter.planning.shape_table import ShapeTable
 from drake_clutter.robots.robot_model import load_robot
@@ -204,6 +207,25 @@ def test_shapes_without_a_core_are_left_to_drake() -> None:
     assert math.isnan(pair.distance(RigidTransform([5.0, 0.0, 0.0]), RigidTransform())[0])
 
 
+def test_only_near_shapes_without_a_core_are_reported(tmp_path: Path) -> None:
+    """Distances to an ellipsoid are Drake's."""
+    path = tmp_path / "egg.sdf"
+    path.write_text(
+        '<sdf version="1.9"><model name="egg"><link name="egg"><collision name="egg"><geometry>'
+        "<ellipsoid><radii>0.1 0.1 0.2</radii></ellipsoid>"
+        "</geometry></collision></link></model></sdf>"
+    )
+    cell = cell_with()
+    fixture = Fixture(name="egg", model=str(path), pose=PoseSpec(translation=(0.3, 0.0, 0.6)))
+    model = CollisionModel(cell.model_copy(update={"fixtures": (fixture,)}), [])
+    q = np.array(cell.robot.home)
+    distances = [d.distance for d in model.distances_below(q, 3.0) if d.pair[1] == "egg"]
+    assert len(distances) >= 7, "every part of the arm"
+    for threshold in (0.5 * min(distances), float(np.median(distances))):
+        found = [d.distance for d in model.distances_below(q, threshold) if d.pair[1] == "egg"]
+        assert sorted(found) == sorted(d for d in distances if d <= threshold)
+
+
 def test_penetration_of_a_held_object_is_drakes() -> None:
     """A box that sinks 0.4 mm into the floor, and one that stands beside it."""
     cell = cell_with()
@@ -220,6 +242,9 @@ def test_penetration_of_a_held_object_is_drakes() -> None:
     found = {d.pair: d.distance for d in model.distances_below(q, 0.05)}
     assert found[box.name, "floor"] == pytest.approx(-0.0004, abs=1e-9)
     model.detach_object()
+    everything = model.distances_along(q[None], 2.0)
+    assert len(everything.distances) > 20
+    assert not model.is_of_attached(everything).any()
     assert (box.name, "floor") not in {d.pair for d in model.distances_below(q, 0.05)}
 
 

@@ -4,14 +4,19 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from conftest import CLASSES, GRAMMARS, rng, world_with
+from conftest import CLASSES, DEFAULT_CELL, GRAMMARS, rng, world_with
 from numpy.typing import NDArray
 
 from drake_clutter.config import ClutterConfig, LayoutConfig
 from drake_clutter.grammar import ClutterGraph, Derivation, NodeBudget, Orientation, uniform_choice
 from drake_clutter.grammar.clutter_graph import DUMMY
 from drake_clutter.scenes.geometry import max_penetration
-from drake_clutter.scenes.layout import LayoutFailure, LayoutFailureReason, lay_out
+from drake_clutter.scenes.layout import (
+    LayoutFailure,
+    LayoutFailureReason,
+    _sample_positions,
+    lay_out,
+)
 from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.seeding import item_rng
 
@@ -244,3 +249,13 @@ def test_stacks_are_spread_over_the_whole_tray(axis: int) -> None:
     assert abs(drawn).max() > 0.98 * reach
     assert abs(drawn.mean()) < 4 * reach / np.sqrt(3 * 400)
     assert drawn.std() == pytest.approx(reach / np.sqrt(3), rel=0.1)
+
+
+def test_a_stack_that_just_fits_is_in_the_middle() -> None:
+    support = DEFAULT_CELL.support
+    config = LayoutConfig()
+    half_size = support.half_size - config.stack_gap
+    centers = _sample_positions(half_size[None], support, config, rng())
+    assert centers is not None
+    assert centers == pytest.approx(np.zeros((1, 2)), abs=1e-12)
+    assert _sample_positions(half_size[None] + 0.001, support, config, rng()) is None

@@ -328,3 +328,21 @@ def test_a_trajectory_of_ones_own_grasps_an_object() -> None:
     assert simulation.gripper.status.held == box.name
     raised = result.poses[box.name].p[2] - box.X_TO.p[2]
     assert raised == pytest.approx(0.15 - top, abs=0.004)
+
+
+def test_trees_grow_in_steps_up_to_a_number_of_attempts() -> None:
+    """Neighbors are at most 0.4 rad apart, and each attempt checks one line."""
+    start, goal = np.array([-1.0, 0.0]), np.array([1.0, 0.5])
+    path = connect_trees(start, goal, lambda q, q_end: True, lambda: goal, 50)
+    assert path is not None
+    steps = np.abs(np.diff(path, axis=0)).max(axis=1)
+    assert steps.max() == pytest.approx(0.4)
+    assert len(steps) == 5
+    checked = list[float]()
+
+    def is_free(q: np.ndarray, q_end: np.ndarray) -> bool:
+        checked.append(0.0)
+        return False
+
+    assert connect_trees(start, goal, is_free, lambda: np.array([0.0, 3.0]), 20) is None
+    assert len(checked) == 20

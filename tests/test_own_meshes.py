@@ -12,6 +12,7 @@ import pytest
 import trimesh
 from conftest import resting, rng, scene_of
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 from test_settle import BELOW
 from test_static_judge import STEP
@@ -20,6 +21,7 @@ from drake_clutter.assets import build_assets
 from drake_clutter.catalog import ObjectClass, load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
+from drake_clutter.planning.place_check import resting_tilt
 from drake_clutter.scenes.geometry import objects_resting_on
 from drake_clutter.scenes.interfaces import (
     Detection,
@@ -37,7 +39,7 @@ from drake_clutter.simulation.camera_renderer import CameraRenderer
 from drake_clutter.simulation.drake_judge import DrakeJudge
 from drake_clutter.stability.contacts import contact_polygon
 from drake_clutter.stability.ray_caster import RayCaster
-from drake_clutter.stability.shape_table import ShapeTable
+from drake_clutter.stability.shape_table import ShapeTable, orient_shape
 from drake_clutter.stability.static_executor import StaticExecutor
 from drake_clutter.stability.static_judge import StaticStabilityJudge
 
@@ -408,3 +410,21 @@ def test_what_is_put_on_or_into_a_cup(
 def detected(o: SceneObject) -> Detection:
     """Return an object as a detection without pixels."""
     return Detection(o.name, o.object_class, o.X_TO, np.zeros((1, 1), np.bool_))
+
+
+def test_the_top_of_a_bracket_is_that_of_its_wall(own: dict[str, ObjectClass]) -> None:
+    """The wall is 30 mm thick and 60 mm wide, at the left end of 100 mm, and 80 mm high."""
+    shape = orient_shape(own["bracket"], (1.0, 0.0, 0.0, 0.0))
+    assert shape.top_z == pytest.approx(0.040, abs=1e-5)
+    assert shape.top.min(axis=0) == pytest.approx([-0.050, -0.030], abs=1e-5)
+    assert shape.top.max(axis=0) == pytest.approx([-0.020, 0.030], abs=1e-5)
+
+
+def test_a_mesh_on_any_of_its_faces_is_not_tilted(own: dict[str, ObjectClass]) -> None:
+    """The product of a normal with itself may exceed 1 by rounding."""
+    for object_class in own.values():
+        for normal in ConvexHull(object_class.corners).equations[:, :3]:
+            side = np.cross(normal, [0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0.0, 0.0])
+            side /= np.linalg.norm(side)
+            rotation = np.array([side, np.cross(-normal, side), -normal])
+            assert resting_tilt(object_class, rotation) == pytest.approx(0.0, abs=1e-7)

@@ -102,3 +102,12 @@ def test_friction_holds_a_box_from_pick_to_place(cell: WorkCell) -> None:
     assert result.slip < 0.003
     assert result.position_error < 0.003
     assert result.poses["sugar_box"].p[2] == pytest.approx(0.0875, abs=0.001)
+
+
+def test_jaws_without_an_object_are_open(cell: WorkCell) -> None:
+    """The joints of the jaws are 0 where they are fully open."""
+    planner = PickPlacePlanner(cell, PlannerConfig(optimize=False))
+    q = np.array(cell.robot.home) + 0.2 * np.eye(6)[0]
+    plan = planner.plan_move(planner.home_state([]), q.tolist())
+    assert not isinstance(plan, PlanningFailure)
+    assert {step.joints for step in plan.steps} == {(0.0, 0.0)}

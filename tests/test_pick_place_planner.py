@@ -111,6 +111,21 @@ def assert_collision_free(plan: PickPlacePlan, objects: list[SceneObject], *supp
         assert least > min(phase.min_distance.distance, 0.03) - 0.001
 
 
+def test_a_plan_keeps_the_distance_and_names_the_smallest(plan: PickPlacePlan) -> None:
+    """Pairs that may touch, such as the cup and the object, do not count."""
+    for segment in plan.segments:
+        assert PlannerConfig().min_distance <= segment.min_distance.distance < 0.05
+
+
+def test_grasps_are_sampled_every_12_mm() -> None:
+    """The top is larger than the grid of nine points around its center."""
+    grasps = planner().grasps(resting("cracker_box"))
+    assert not isinstance(grasps, PlanningFailure)
+    points = np.array([grasp.X_TG.translation()[:2] for grasp in grasps if grasp.tool == "large"])
+    distances = np.linalg.norm(points[:, None] - points, axis=2) + np.eye(len(points))
+    assert distances.min(axis=1) == pytest.approx(0.012)
+
+
 def test_a_plan_is_free_of_collisions(plan: PickPlacePlan) -> None:
     assert_collision_free(plan, PILE)
 

@@ -15,7 +15,11 @@ from drake_clutter.planning.pick_place_plan import (
     PlanningFailureReason,
 )
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
-from drake_clutter.planning.place_check import _overhang, check_place, resting_tilt
+from drake_clutter.planning.place_check import (
+    _overhang,
+    check_place,
+    resting_tilt,
+)
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.resources import resource_path
 from drake_clutter.robots.robot_model import load_robot
@@ -248,3 +252,27 @@ def test_the_overhang_beyond_a_line_and_beyond_a_polygon() -> None:
     square = np.array([[0.0, 0.0], [0.2, 0.0], [0.2, 0.2], [0.0, 0.2]])
     assert _overhang(square, np.array([0.1, 0.15])) == 0.0
     assert _overhang(square, np.array([0.1, 0.25])) == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize(("overlap", "expected"), [(0.0003, None), (0.0007, 0.0007)])
+def test_a_neighbor_on_the_same_floor_is_touched_but_carries_nothing(
+    overlap: float, expected: float | None
+) -> None:
+    """The bottoms of the two boxes are level, so that neither is below the other."""
+    other = resting("sugar_box", Orientation.UPRIGHT_0, name="other")
+    width = float(np.ptp(BOX.bounds_T, axis=0)[1])
+    beside = BOX.X_TO.translated((0.0, width - overlap, 0.0))
+    found = check("sugar_box", beside, objects=[BOX, other])
+    if expected is None:
+        assert found is None
+    else:
+        assert found is not None
+        assert (found.reason, found.detail) == (PlanningFailureReason.PLACE_IN_COLLISION, "other")
+        assert found.value == pytest.approx(expected, abs=1e-5)
+
+
+def test_the_overhang_beyond_a_triangle() -> None:
+    """The long side leads from (0.3, 0) to (0, 0.4), 0.24 m from the corner at the origin."""
+    triangle = np.array([[0.0, 0.0], [0.3, 0.0], [0.0, 0.4]])
+    assert _overhang(triangle, np.array([0.1, 0.1])) == 0.0
+    assert _overhang(triangle, np.array([0.8, 0.6]) * 0.27) == pytest.approx(0.03)

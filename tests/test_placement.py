@@ -11,7 +11,12 @@ from scipy.spatial.transform import Rotation
 from drake_clutter.config import ExplorationConfig, PlacementConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
-from drake_clutter.scenes.free_space import CELL_SIZE, is_observed_free, next_free_cell
+from drake_clutter.scenes.free_space import (
+    CELL_SIZE,
+    is_observed_free,
+    levels_above,
+    next_free_cell,
+)
 from drake_clutter.scenes.geometry import penetration_depth
 from drake_clutter.scenes.interfaces import Move, Observation
 from drake_clutter.scenes.placement import (
@@ -360,3 +365,10 @@ def test_only_points_in_the_image_are_seen_to_be_free() -> None:
         rows, state = np.zeros((1, 3), np.int64), np.zeros((1, 1), np.int8)
         found = next_free_cell(depth, camera.pinhole, *grid, rows, cell, 0, state)
         assert found == (0 if is_in_image else 1)
+
+
+def test_the_space_of_an_object_is_seen_through_every_20_mm() -> None:
+    """The lowest level is 4 mm above the floor, the largest difference of equal depths."""
+    camera = DEFAULT_CELL.camera
+    assert camera.is_vertical
+    assert levels_above(0.1, 0.05, camera) == pytest.approx([0.104, 0.124, 0.144])

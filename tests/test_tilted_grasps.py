@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from conftest import CLASSES, DEFAULT_CELL, resting, scene_of
 from scipy.spatial.transform import Rotation
 
 from benchmarks.motion_limits import limit_ratios
+from drake_clutter.catalog import Shape
 from drake_clutter.config import ExplorationConfig
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
@@ -17,7 +19,7 @@ from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import DEPARTURE_DISTANCE
 from drake_clutter.scenes.interfaces import Move
 from drake_clutter.scenes.placement import find_free_placements
-from drake_clutter.scenes.release_orientation import resting_quaternion
+from drake_clutter.scenes.release_orientation import resting_quaternion, yaw_steps
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.station.station_simulation import StationSimulation
 
@@ -79,6 +81,7 @@ def test_a_leaning_box_is_put_down_flat(detector: LabelDetector) -> None:
         ("tomato_soup_can", (40, 0, 0), (0, 0, 0)),
         ("tomato_soup_can", (60, 0, 0), (0, 0, 0)),
         ("large_marker", (0, 70, 0), (0, 90, 0)),
+        ("large_marker", (0, 70, 30), (0, 90, 30)),
     ],
 )
 def test_the_closest_resting_orientation(
@@ -93,3 +96,26 @@ def test_the_closest_resting_orientation(
     slight = quaternion((2, 1, 0))
     if name != "large_marker":
         assert resting_quaternion(CLASSES[name], slight) == slight
+
+
+@pytest.mark.parametrize(("tilt", "height"), [(40.0, 1.0), (50.0, 0.0)])
+def test_a_cylinder_that_may_stand_or_lie_turns_to_the_nearer_of_the_two(
+    tilt: float, height: float
+) -> None:
+    pin = replace(CLASSES["tomato_soup_can"], only_rest=None)
+    w, x, y, z = Rotation.from_euler("x", tilt, degrees=True).as_quat(scalar_first=True)
+    found = Pose((0.0, 0.0, 0.0), resting_quaternion(pin, (w, x, y, z))).rotation
+    assert abs(found[2, 2]) == pytest.approx(height, abs=1e-9)
+
+
+def test_rotations_that_change_the_outline_are_tried() -> None:
+    """Boxes are symmetric by half a turn, upright cans by any turn; meshes are not."""
+    upright = (1.0, 0.0, 0.0, 0.0)
+    box = CLASSES["sugar_box"]
+    first, later = yaw_steps(box, upright)
+    assert first == (0, 90)
+    assert later == (15, 30, 45, 60, 75, 105, 120, 135, 150, 165)
+    mesh_first, mesh_later = yaw_steps(replace(box, shape=Shape.MESH), upright)
+    assert mesh_first == (0, 90, 180, 270)
+    assert {*mesh_first, *mesh_later} == set(range(0, 360, 15))
+    assert yaw_steps(CLASSES["tomato_soup_can"], upright) == ((0,),)
