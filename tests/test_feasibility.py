@@ -20,12 +20,6 @@ from drake_clutter.commands import feasibility_parts, feasibility_run
 from drake_clutter.config import ClutterConfig
 from drake_clutter.feasibility.base_search import make_base_grids, select_finalists
 from drake_clutter.feasibility.home_search import Home, HomeSearch, view_corners
-from drake_clutter.feasibility.inverse_reachability import (
-    SPACING,
-    InverseReachabilityMap,
-    MovePoses,
-    find_move_poses,
-)
 from drake_clutter.feasibility.margins import arm_reach, compute_margins, scaled_jacobians
 from drake_clutter.feasibility.move_study import (
     MOVE_RECORD_FIELDS,
@@ -302,55 +296,6 @@ def test_a_tilted_tool_points_to_its_side() -> None:
     assert X[:3, 3] == pytest.approx([0.1, 0.2, 0.3])
     assert X[:3, :3] @ X[:3, :3].T == pytest.approx(np.eye(3))
     assert np.linalg.det(X[:3, :3]) == pytest.approx(1.0)
-
-
-def disk_map(radius: float, *, branch: int = 0, lowest: float = 0.1) -> InverseReachabilityMap:
-    """Return a map in which one branch reaches a disk around the base, at z from 0 to 1 m."""
-    radii = np.arange(0.0, 1.0, SPACING)
-    shape = len(radii), 51, 24
-    branches = np.zeros(shape, np.uint8)
-    branches[radii <= radius] = 1 << branch
-    heights = np.full((*shape, 8), lowest, np.float32)
-    return InverseReachabilityMap(np.arange(51) * np.float64(SPACING), branches, heights)
-
-
-def move_rows(p_pick: Sequence[float], p_place: Sequence[float], top: float) -> MovePoses:
-    row = (*p_pick[:2], 0.3, *p_place[:2], 0.3, p_pick[2], p_place[2], top)
-    return MovePoses.join([np.array([row])])
-
-
-def test_inverse_reachability_of_a_disk() -> None:
-    """A base reaches a move if pick, place and the points above them are in its disk."""
-    moves = move_rows((0.3, 0.0, 0.1), (0.3, 0.4, 0.2), 0.4)
-    bases = np.array([[0.0, 0.2, 0.0], [-0.2, 0.2, 0.0], [0.3, 0.2, 0.15], [0.3, 0.2, -0.7]])
-    reaches = disk_map(0.45).find_reachable(moves, bases, table_height=-1.0)[:, 0]
-    # 0.36 m to both; 0.54 m to both; the pick is below the map; the way is above it.
-    assert reaches.tolist() == [True, False, False, False]
-
-
-def test_inverse_reachability_keeps_links_above_the_table() -> None:
-    moves = move_rows((0.3, 0.0, 0.1), (0.3, 0.1, 0.2), 0.4)
-    base = np.array([[0.0, 0.0, 0.0]])
-    assert disk_map(0.45, lowest=0.1).find_reachable(moves, base, table_height=0.05).all()
-    assert not disk_map(0.45, lowest=0.1).find_reachable(moves, base, table_height=0.096).any()
-
-
-def test_move_poses_follow_the_object() -> None:
-    """The place poses of the tool differ from the grasp by the move of the object."""
-    planner = PickPlacePlanner(DEFAULT_CELL, PlannerConfig())
-    can = SCENE["tomato_soup_can"]
-    grasps = planner.grasps(can)
-    assert not isinstance(grasps, PlanningFailure)
-    place = Pose((0.2, 0.1, can.X_TO.p[2] + 0.05), can.X_TO.quaternion)
-    rows = find_move_poses(can, place, [grasps[0]], planner.config)
-    assert rows.shape == (12, 9)
-    x, y, _, place_x, place_y, _, z, place_z, top = rows.T
-    assert place_x - x == pytest.approx(0.3 * np.ones(12))
-    assert place_y - y == pytest.approx(0.3 * np.ones(12))
-    assert place_z - z == pytest.approx(0.05 * np.ones(12))
-    assert top - place_z == pytest.approx(planner.config.lift_height * np.ones(12))
-    yaws = np.sort(rows[:, 2] % (2 * math.pi))
-    assert np.diff(yaws) == pytest.approx(np.full(11, math.pi / 6))
 
 
 def test_bases_in_the_support_are_left_out() -> None:

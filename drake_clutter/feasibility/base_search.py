@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.feasibility.arm_clearance import ObstacleTops
 from drake_clutter.feasibility.inverse_reachability import (
     InverseReachabilityMap,
     MovePoses,
@@ -124,6 +125,11 @@ def find_reachable_moves(
     config = PlannerConfig()
     cell = grid.cell.with_support(scene.support)
     planner = PickPlacePlanner(cell, config)
+    tops = {
+        name: ObstacleTops.from_scene(scene, reachability.arm.radii + config.min_distance)
+        for name, reachability in maps.items()
+    }
+    indices = {o.name: k for k, o in enumerate(scene.objects)}
     found: list[NDArray[np.bool_] | None] = []
     for legal in moves:
         picked = scene[legal.move.pick]
@@ -140,7 +146,10 @@ def find_reachable_moves(
             of_tool = [grasp for grasp in grasps if grasp.tool == name]
             poses = find_move_poses(picked, legal.command.X_TO_place, of_tool, config)
             reaches = reachability.find_reachable(
-                MovePoses.join([poses]), grid.bases, cell.table_height
+                MovePoses.join([poses], [indices[picked.name]]),
+                grid.bases,
+                cell.table_height,
+                tops[name],
             )
             is_reachable |= reaches[:, 0]
         found.append(is_reachable)

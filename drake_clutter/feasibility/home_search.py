@@ -30,6 +30,8 @@ NUM_SAMPLES = 2**14
 """Number of configurations that are considered."""
 MAX_CONNECTIONS = 40
 """Number of configurations from which ways to the work are checked, the closest ones first."""
+NUM_COMPARED = 5
+"""Number of homes with ways to all of the work that are compared by ways to other solutions."""
 _WORK_HEIGHTS = (0.10, 0.35)
 """Heights of the work above the floor of the support [m]."""
 _WORK_YAWS = (0.0, math.pi / 2)
@@ -89,7 +91,8 @@ class HomeSearch:
 
         Candidates are spread evenly over the joint ranges. The closest to the work in time is
         returned that is clear of cell and view, holds the arm within half the torque limits, and
-        from which the arm reaches the space above the work on straight lines in joint space.
+        from which the arm reaches the space above the work on straight lines in joint space. Of the
+        first few, it is the one with such lines to the most inverse kinematics solutions.
 
         Args:
             keep: Whether the home of the cell is returned if it keeps the planner's distance.
@@ -99,40 +102,50 @@ class HomeSearch:
         if keep and obstacle is None:
             return Home(tuple(given.tolist()), is_given=True)
         blocking = "" if obstacle is None else " and ".join(obstacle.pair)
-        work = self._work_configurations()
+        work, alternatives = self._work_configurations()
         if not len(work):
             return "no part of the support is in reach"
         candidates = self._candidates()
         times = min_travel_time(candidates[:, None] - work[None], self._robot).mean(axis=1)
-        best: Floats | None = None
-        most = 0
+        best: list[Floats] = []
+        most = 1
         for k in np.argsort(times, kind="stable")[:MAX_CONNECTIONS].tolist():
-            connected = sum(self._is_connected(candidates[k], q) for q in work)
+            connected = self._count_connected(candidates[k], work)
             if connected > most:
-                best, most = candidates[k], connected
-            if most == len(work):
+                best, most = [], connected
+            if connected == most:
+                best.append(candidates[k])
+            if most == len(work) and len(best) == NUM_COMPARED:
                 break
-        if best is None:
+        if not best:
             return "no configuration clears the cell and the camera's view"
-        return Home(tuple(best.round(6).tolist()), is_given=False, obstacle=blocking)
+        home = max(best, key=lambda q: self._count_connected(q, alternatives))
+        return Home(tuple(home.round(6).tolist()), is_given=False, obstacle=blocking)
 
-    def _work_configurations(self) -> Floats:
-        """Return configurations of a downward tool above the support. Shape (k, n).
+    def _count_connected(self, home: Floats, work: Floats) -> int:
+        return sum(self._is_connected(home, q) for q in work)
 
-        For each position it is the solution closest to the middle of the joint ranges that is clear
-        of the cell.
+    def _work_configurations(self) -> tuple[Floats, Floats]:
+        """Return configurations of a downward tool above the support. Shapes (k, n).
+
+        For each position the first is the solution closest to the middle of the joint ranges that
+        is clear of the cell; the others, which objects in the way of the first call for, are clear
+        solutions of other branches.
         """
         x, y = 0.6 * self._cell.support.half_size
         middle = self._robot.position_limits.mean(axis=1)
-        found = []
+        found, others = [], []
         for px, py in ((0.0, 0.0), (-x, -y), (-x, y), (x, -y), (x, y)):
             for pz in _WORK_HEIGHTS:
                 poses = [downward_pose(yaw, np.array([px, py, pz])) for yaw in _WORK_YAWS]
                 q = self._tool.solve_ik(np.array(poses)).reshape(-1, self._robot.num_joints)
                 q = self._robot.unwrap(q[np.isfinite(q[:, 0])], middle)
                 q = q[np.argsort(np.abs(q - middle).max(axis=1), kind="stable")]
-                found += [row for row in q if self._is_clear_of_cell(row)][:1]
-        return np.array(found).reshape(-1, self._robot.num_joints)
+                clear = [row for row in q if self._is_clear_of_cell(row)]
+                found += clear[:1]
+                others += clear[1:]
+        shape = -1, self._robot.num_joints
+        return np.array(found).reshape(shape), np.array(others).reshape(shape)
 
     def _is_clear_of_cell(self, q: Floats) -> bool:
         """Return whether the arm is clear of all but the camera's view."""

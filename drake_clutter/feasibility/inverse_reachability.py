@@ -10,7 +10,7 @@ Frames: T is the support, B is the robot's base, G is a tool of the gripper, poi
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,15 @@ from drake_clutter.cell.gripper import Grasp
 from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.compilation import njit
-from drake_clutter.files import atomic_write
+from drake_clutter.feasibility.arm_clearance import (
+    ArmGeometry,
+    ObstacleTops,
+    collides_with_itself,
+    collides_with_objects,
+    place_capsules,
+    solve_downward,
+)
+from drake_clutter.files import atomic_write, reading_file
 from drake_clutter.planning.collision_model import CollisionModel
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import (
@@ -29,6 +37,7 @@ from drake_clutter.planning.tool_kinematics import (
     is_vertical,
     retreat_along_axis,
 )
+from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.scene_plant import rigid_transform
 
@@ -38,50 +47,63 @@ SPACING = 0.02
 """Spacing of the map in radius and height [m]."""
 NUM_YAWS = 24
 """Number of yaws of the tool relative to the radial direction."""
+MIN_GRASP_DISTANCE = 0.03
+"""Of grasps that are closer to each other, the first stands for the others [m]."""
 _FAR_AWAY = 50.0
 """Distance of the base from the support while the map is built [m]: nothing but itself is near."""
-_MAX_BRANCHES = 8
+_MAX_SOLUTIONS = 8
 
 
 @dataclass(frozen=True, eq=False)
 class InverseReachabilityMap:
     """Reachability of a vertical tool over radius, height and yaw relative to the base.
 
+    Solutions are told apart by their inverse kinematics branches, or for robots without branches by
+    the eighth of a turn in which their first joint is.
+
     Attributes:
         heights: Heights of G in B [m]. Shape (n_z,).
-        branches: Bits of the inverse kinematics branches without self-collision; for robots without
-            branches, bit 0 stands for all. Shape (n_r, n_z, NUM_YAWS).
-        lowest: Height in B of the lowest point of the links on each branch [m]. Shape (n_r, n_z,
+        solutions: Bits of the solutions without self-collision. Shape (n_r, n_z, NUM_YAWS).
+        lowest: Height in B of the lowest point of the links in each solution [m]. Shape (n_r, n_z,
             NUM_YAWS, 8).
+        turns: Position of the first joint in each solution, with the tool along x of B [rad]. Shape
+            (n_r, n_z, NUM_YAWS, 8).
+        turn_limits: Limits of the first joint [rad]. Shape (2,).
+        arm: Geometry of the arm, for checks at exact poses.
     """
 
     heights: Floats
-    branches: NDArray[np.uint8]
+    solutions: NDArray[np.uint8]
     lowest: NDArray[np.float32]
+    turns: NDArray[np.float32]
+    turn_limits: Floats
+    arm: ArmGeometry
 
     def find_reachable(
-        self, moves: "MovePoses", bases: Floats, table_height: float
+        self, moves: "MovePoses", bases: Floats, table_height: float, tops: ObstacleTops
     ) -> NDArray[np.bool_]:
         """Return which moves are reachable from each base.
 
         Args:
             moves: The moves.
-            bases: x, y, z of upright bases in T [m]; the yaw does not count, as long as the first
-                joint turns freely. Shape (m, 3) or more columns.
+            bases: x, y, z [m] and yaw [rad] of upright bases in T. Shape (m, 4).
             table_height: Height of the table in T [m].
+            tops: Obstacles of the arm at the grasp and at the place.
 
         Returns:
             Whether each move is reachable from each base. Shape (m, k).
         """
+        arm = self.arm
         return np.asarray(
             _find_reachable(
-                self.branches,
-                self.lowest,
-                self.heights[0],
-                moves.poses,
-                moves.starts,
+                (self.solutions, self.lowest, self.turns, self.turn_limits, self.heights[0]),
+                (arm.fixed, arm.lengths, arm.X_0B, arm.X_G6),
+                (arm.depths, arm.ends, arm.radii, arm.may_touch, arm.pairs),
+                (tops.first, tops.owners, tops.second, tops.corner),
+                (moves.poses, moves.starts, moves.picked),
                 np.ascontiguousarray(bases, float),
                 table_height + PlannerConfig().min_distance,
+                PlannerConfig().min_distance,
             )
         )
 
@@ -94,16 +116,18 @@ class MovePoses:
         poses: x, y [m] and yaw [rad] at the grasp, then at the place; heights at the grasp, at the
             place, and in between [m]. Shape (l, 9).
         starts: Index of the first row of each move, and the number of all. Shape (k + 1,).
+        picked: Index in the scene of the object that each move picks. Shape (k,).
     """
 
     poses: Floats
     starts: NDArray[np.int64]
+    picked: NDArray[np.int64]
 
     @staticmethod
-    def join(moves: Sequence[Floats]) -> "MovePoses":
+    def join(moves: Sequence[Floats], picked: Sequence[int]) -> "MovePoses":
         """Return the poses of moves from those of each, see `find_move_poses`."""
         starts = np.cumsum([0, *map(len, moves)])
-        return MovePoses(np.vstack([np.empty((0, 9)), *moves]), starts)
+        return MovePoses(np.vstack([np.empty((0, 9)), *moves]), starts, np.array(picked, np.int64))
 
 
 def find_move_poses(
@@ -127,11 +151,16 @@ def find_move_poses(
         @ rigid_transform(picked.X_TO).inverse().GetAsMatrix4()
     )
     rows = []
+    positions = list[Floats]()
     for grasp in grasps:
         X_pick = retreat_along_axis(grasp.X_TG.GetAsMatrix4(), config.lip_gap)
         X_place = X_moved @ X_pick
         if not (is_vertical(X_pick) and is_vertical(X_place)):
             continue
+        p_TG = X_pick[:3, 3]
+        if any(np.linalg.norm(p_TG - other) < MIN_GRASP_DISTANCE for other in positions):
+            continue
+        positions.append(p_TG)
         number = grasp.num_angles or config.num_yaws
         turns = np.arange(number) * (2 * math.pi / number)
         heights = X_pick[2, 3], X_place[2, 3], X_pick[2, 3] - bottoms[0] + transfer_bottom
@@ -147,15 +176,25 @@ def find_move_poses(
 
 
 def load_inverse_reachability(path: Path) -> InverseReachabilityMap:
-    """Return a map that `save_inverse_reachability` wrote."""
-    with np.load(path) as arrays:
-        return InverseReachabilityMap(**{name: arrays[name] for name in arrays.files})
+    """Return a map that `save_inverse_reachability` wrote.
+
+    Raises:
+        InputError: The file is not such a map.
+    """
+    with reading_file(path, "an inverse reachability map"), np.load(path) as arrays:
+        names = [field.name for field in fields(ArmGeometry)]
+        arm = ArmGeometry(**{name: arrays[f"arm.{name}"] for name in names})
+        names = [field.name for field in fields(InverseReachabilityMap) if field.name != "arm"]
+        return InverseReachabilityMap(**{name: arrays[name] for name in names}, arm=arm)
 
 
 def save_inverse_reachability(path: Path, reachability: InverseReachabilityMap) -> None:
     """Write a map as a NumPy archive."""
+    arrays = dict(vars(reachability))
+    arm: ArmGeometry = arrays.pop("arm")
+    arrays |= {f"arm.{name}": array for name, array in vars(arm).items()}
     with atomic_write(path) as temporary:
-        np.savez_compressed(temporary, **vars(reachability))
+        np.savez_compressed(temporary, **arrays)
 
 
 def build_inverse_reachability(cell: WorkCell, tool_name: str) -> InverseReachabilityMap:
@@ -165,8 +204,16 @@ def build_inverse_reachability(cell: WorkCell, tool_name: str) -> InverseReachab
         cell: Work cell; only robot and gripper count.
         tool_name: Name of the tool.
     """
-    base = PoseSpec(translation=(-_FAR_AWAY, 0.0, 2.0))
-    robot_spec = cell.robot.model_copy(update={"base": base})
+    limits = load_robot(cell.robot).position_limits
+    turn_limits = limits[0].copy()
+    limits[0] = min(turn_limits[0], -math.pi), max(turn_limits[1], math.pi)
+    update = {
+        "base": PoseSpec(translation=(-_FAR_AWAY, 0.0, 2.0)),
+        "limits": cell.robot.limits.model_copy(
+            update={"position": tuple(map(tuple, limits.tolist()))}
+        ),
+    }
+    robot_spec = cell.robot.model_copy(update=update)
     apart = cell.model_copy(update={"robot": robot_spec, "fixtures": ()})
     tool = ToolKinematics(apart, tool_name)
     robot = tool.robot
@@ -180,9 +227,11 @@ def build_inverse_reachability(cell: WorkCell, tool_name: str) -> InverseReachab
     yaws = np.arange(NUM_YAWS) * (2 * math.pi / NUM_YAWS)
     has_branches = robot.ur_fit is not None
     shape = len(radii), len(heights), NUM_YAWS
-    branches = np.zeros(shape, np.uint8)
-    lowest = np.full((*shape, _MAX_BRANCHES), -np.inf, np.float32)
-    p_TB = np.array(base.translation)
+    found = np.zeros(shape, np.uint8)
+    lowest = np.full((*shape, _MAX_SOLUTIONS), -np.inf, np.float32)
+    turns = np.zeros(lowest.shape, np.float32)
+    close_pairs = set[tuple[int, int]]()
+    p_TB = np.array(robot_spec.base.translation)
     for i, radius in enumerate(radii.tolist()):
         # The pose is out of reach where the tool's tip is outside the sphere of the arm.
         rows = np.flatnonzero(radius**2 + heights**2 < reach**2)
@@ -198,67 +247,144 @@ def build_inverse_reachability(cell: WorkCell, tool_name: str) -> InverseReachab
         if not len(index):
             continue
         solutions = q[index[:, 0], index[:, 1]]
-        is_free = np.ones(len(index), bool)
-        is_free[model.distances_along(solutions, PlannerConfig().min_distance).rows] = False
+        near = model.distances_along(solutions, PlannerConfig().min_distance)
+        close_pairs |= {(first, second) for first, second in near.pairs.tolist()}
+        is_blocked = np.zeros(len(index), bool)
+        is_blocked[near.rows] = True
         low = model.lowest_points(solutions) - p_TB[2]
-        for (pose, branch), height in zip(index[is_free], low[is_free], strict=True):
-            j, yaw = rows[pose // NUM_YAWS], pose % NUM_YAWS
-            bit = branch if has_branches else 0
-            branches[i, j, yaw] |= 1 << bit
-            lowest[i, j, yaw, bit] = max(lowest[i, j, yaw, bit], height)
-    return InverseReachabilityMap(heights, branches, lowest)
+        first = solutions[~is_blocked, 0]
+        bits = index[~is_blocked, 1]
+        if not has_branches:
+            bits = (np.floor(first / (2 * math.pi / _MAX_SOLUTIONS)) % _MAX_SOLUTIONS).astype(int)
+        for (pose, _), bit, height, turn in zip(
+            index[~is_blocked].tolist(),
+            bits.tolist(),
+            low[~is_blocked].tolist(),
+            first.tolist(),
+            strict=True,
+        ):
+            cell_index = i, rows[pose // NUM_YAWS], pose % NUM_YAWS
+            found[cell_index] |= 1 << bit
+            if height > lowest[*cell_index, bit]:
+                lowest[*cell_index, bit], turns[*cell_index, bit] = height, turn
+    arm = ArmGeometry.from_model(tool, cell.gripper.tools[tool_name], model, close_pairs)
+    return InverseReachabilityMap(heights, found, lowest, turns, turn_limits, arm)
 
 
 @njit(cache=True, nogil=True)
-def _find_reachable(branches, lowest, first_height, poses, starts, bases, table):  # type: ignore[no-untyped-def]
+def _is_within(turn, lower, upper):  # type: ignore[no-untyped-def]
+    """Return whether an angle or one that differs by full turns is within limits."""
+    return lower + (turn - lower) % (2 * np.pi) <= upper
+
+
+@njit(cache=True, nogil=True)
+def _find_reachable(grid, kinematics, capsules, tops, moves, bases, table, gap):  # type: ignore[no-untyped-def]
     """Return whether each move is reachable from each base, shape (m, k).
 
     A move is reachable if one branch reaches the grasp, the place, the two points above them and
-    the one halfway between these, with the links above the table.
+    the one halfway between these, with the links above the table. For arms with inverse kinematics
+    in closed form, the solution at the exact pose must be clear of itself, and at the grasp and the
+    place of the objects.
+
+    Args:
+        grid: Arrays of the map, and its first height.
+        kinematics: Arrays of `ArmGeometry` for the inverse kinematics.
+        capsules: Arrays of `ArmGeometry` for the clearances.
+        tops: Arrays of `ObstacleTops`.
+        moves: Arrays of `MovePoses`.
+        bases: x, y, z [m] and yaw [rad] of the bases. Shape (m, 4).
+        table: Smallest height of the links in T [m].
+        gap: Smallest distance of links from each other [m].
     """
-    num_radii, num_heights, num_yaws = branches.shape
+    solutions, lowest, turns, turn_limits, first_height = grid
+    fixed, lengths, X_0B, X_G6 = kinematics
+    depths, ends, radii, may_touch, pairs = capsules
+    ignores = np.ones(len(depths), np.bool_)
+    first, owners, second, corner = tops
+    poses, starts, picked = moves
+    is_exact = len(lengths) > 0
+    num_radii, num_heights, num_yaws = solutions.shape
     found = np.zeros((len(bases), len(starts) - 1), np.bool_)
-    cells = np.empty((5, 3), np.int64)
+    n = max(len(fixed) - 1, 0)
+    revolute = np.ones(n, np.bool_)
+    frames, moved = np.empty((n + 1, 4, 4)), np.empty((n, 3, 4))
+    placed = np.empty((len(depths), 2, 3))
+    points = np.empty((5, 4))
+    X, q = np.empty((2, 4, 4)), np.empty(6)
     for b in range(len(bases)):
-        x, y, z = bases[b, 0], bases[b, 1], bases[b, 2]
+        x, y, z, base_yaw = bases[b]
+        c, sine = np.cos(base_yaw), np.sin(base_yaw)
         for move in range(len(starts) - 1):
             for row in range(starts[move], starts[move + 1]):
                 turn = poses[row, 5] - poses[row, 2]
                 turn -= 2 * np.pi * np.floor(turn / (2 * np.pi) + 0.5)
-                common = 255
+                common = np.int64(255)
                 # The grasp and the point above it, halfway, the point above the place, the place.
                 for point in range(5):
                     s = min(max((point - 1) / 2, 0.0), 1.0)
                     dx = (1 - s) * poses[row, 0] + s * poses[row, 3] - x
                     dy = (1 - s) * poses[row, 1] + s * poses[row, 4] - y
-                    i = int(np.sqrt(dx * dx + dy * dy) / SPACING + 0.5)
-                    relative = (poses[row, 2] + s * turn - np.arctan2(dy, dx)) / (2 * np.pi)
-                    k = int(np.floor(relative * num_yaws + 0.5)) % num_yaws
+                    yaw = poses[row, 2] + s * turn
+                    azimuth = np.arctan2(dy, dx)
                     height = poses[row, 8]
                     if point == 0:
                         height = poses[row, 6]
                     elif point == 4:
                         height = poses[row, 7]
+                    points[point, 0], points[point, 1] = c * dx + sine * dy, c * dy - sine * dx
+                    points[point, 2], points[point, 3] = height - z, yaw - base_yaw
+                    i = int(np.sqrt(dx * dx + dy * dy) / SPACING + 0.5)
+                    k = int(np.floor((yaw - azimuth) / (2 * np.pi) * num_yaws + 0.5)) % num_yaws
                     j = int(np.floor((height - z - first_height) / SPACING + 0.5))
-                    if i >= num_radii or j < 0 or j >= num_heights:
-                        common = 0
-                        break
-                    common &= branches[i, j, k]
+                    usable = np.int64(0)
+                    if i < num_radii and 0 <= j < num_heights:
+                        usable = np.int64(solutions[i, j, k])
+                        for bit in range(8):
+                            if usable >> bit & 1 and (
+                                lowest[i, j, k, bit] + z < table
+                                or not _is_within(
+                                    turns[i, j, k, bit] + azimuth - base_yaw,
+                                    turn_limits[0],
+                                    turn_limits[1],
+                                )
+                            ):
+                                usable ^= 1 << bit
+                    common = common & usable if is_exact else usable
                     if common == 0:
                         break
-                    cells[point, 0], cells[point, 1], cells[point, 2] = i, j, k
-                bit = 0
-                while common and not found[b, move]:
-                    if common & 1:
-                        clear = True
-                        for c in range(5):
-                            low = lowest[cells[c, 0], cells[c, 1], cells[c, 2], bit]
-                            if low + z < table:
-                                clear = False
-                        if clear:
-                            found[b, move] = True
-                    common >>= 1
-                    bit += 1
+                if common == 0:
+                    continue
+                if not is_exact:
+                    found[b, move] = True
+                    break
+                for bit in range(8):
+                    is_clear = common >> bit & 1 == 1
+                    # The grasp and the place first, where the arm is lowest.
+                    for point in (0, 4, 2, 1, 3):
+                        if not is_clear:
+                            break
+                        is_clear = solve_downward(lengths, X_0B, X_G6, points[point], bit, X, q)
+                        if not is_clear:
+                            break
+                        place_capsules(fixed, revolute, depths, ends, q, frames, moved, placed)
+                        if collides_with_itself(placed, radii, pairs, gap):
+                            is_clear = False
+                        elif point == 0 or point == 4:
+                            # At the place the picked object is no longer where it was.
+                            is_clear = not collides_with_objects(
+                                placed,
+                                radii,
+                                bases[b],
+                                first,
+                                owners,
+                                second,
+                                corner,
+                                may_touch if point == 0 else ignores,
+                                picked[move],
+                            )
+                    if is_clear:
+                        found[b, move] = True
+                        break
                 if found[b, move]:
                     break
     return found

@@ -23,7 +23,12 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.planning.shape_table import FoundDistances, ShapeTable, hull_corners
+from drake_clutter.planning.shape_table import (
+    FoundDistances,
+    MovingCapsules,
+    ShapeTable,
+    hull_corners,
+)
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.occlusion import OccludedBox
 from drake_clutter.scenes.scene import Pose, SceneObject
@@ -330,6 +335,14 @@ class CollisionModel:
                 [self._pairs[~is_attached], links[:, ::-1], np.array(added, np.int64)]
             )
         return self._pairs_by_attached[name]
+
+    def moving_capsules(self) -> MovingCapsules:
+        """Return the round shapes of links and gripper, see `MovingCapsules`."""
+        return self._shapes.moving_capsules()
+
+    def owner_name(self, shape: int) -> str:
+        """Return the name of the owner of a shape, see `SignedDistance.pair`."""
+        return self._shape_names[shape]
 
     def distances_along(
         self, path: Floats, max_distance: float, *, with_gradients: bool = False

@@ -105,6 +105,25 @@ class FoundDistances:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class MovingCapsules:
+    """Round shapes that move with an arm, as capsules.
+
+    A cylinder is represented by the longest capsule of its radius inside, at least a ball.
+
+    Attributes:
+        shapes: Indices of the shapes. Shape (c,).
+        depths: Number of joints that move each shape. Shape (c,).
+        ends: Ends of the axes in J [m]. Shape (c, 2, 3).
+        radii: Radii [m]. Shape (c,).
+    """
+
+    shapes: Integers
+    depths: Integers
+    ends: Floats
+    radii: Floats
+
+
 class ShapeTable:
     """Shapes of a scene, some of which move with the joints of an arm."""
 
@@ -160,6 +179,17 @@ class ShapeTable:
         """Attach a shape to the flange F. Shape (4, 4)."""
         self._depths[shape] = self._chain.num_joints
         self._X_JS[shape] = self._fixed[-1] @ X_FS
+
+    def moving_capsules(self) -> MovingCapsules:
+        """Return the round shapes that move with the arm; boxes and hulls are left out."""
+        is_cylinder = self._kinds == int(CoreKind.CYLINDER)
+        is_round = is_cylinder | (self._kinds == int(CoreKind.SEGMENT))
+        shapes = np.flatnonzero((self._depths > 0) & is_round)
+        radii = np.where(is_cylinder, self._sizes[:, 0], self._radii)
+        halves = np.where(is_cylinder, np.maximum(self._sizes[:, 2] - radii, 0), self._sizes[:, 2])
+        X, half = self._X_JS[shapes], halves[shapes, None]
+        ends = [X[:, :3, 3] + sign * half * X[:, :3, 2] for sign in (-1, 1)]
+        return MovingCapsules(shapes, self._depths[shapes], np.stack(ends, axis=1), radii[shapes])
 
     def find_distances(
         self, path: Floats, pairs: Integers, max_distance: float, *, with_gradients: bool

@@ -200,67 +200,72 @@ def ik_branches(
         parameters.d[5],
     )
     return np.asarray(
-        _ik_branches(X.reshape(-1, 4, 4), singular_wrist_3, *lengths).reshape(*X.shape[:-2], 8, 6)
+        _solve_branches(X.reshape(-1, 4, 4), singular_wrist_3, *lengths).reshape(
+            *X.shape[:-2], 8, 6
+        )
     )
 
 
 @njit(cache=True)
-def _ik_branches(X_B6, singular_wrist_3, d1, a2, a3, d4, d5, d6):  # type: ignore[no-untyped-def]
+def solve_branch(X, branch, singular_wrist_3, d1, a2, a3, d4, d5, d6, q):  # type: ignore[no-untyped-def]
+    """Write the solution of a pose X (4, 4) on a branch to q, and return whether there is one."""
+    # Origin of frame 5.
+    x = X[0, 3] - d6 * X[0, 2]
+    y = X[1, 3] - d6 * X[1, 2]
+    z = X[2, 3] - d6 * X[2, 2]
+    reach = np.hypot(x, y)
+    if reach < abs(d4):
+        return False
+    shoulder = 1 - 2 * (branch // 4)
+    wrist = 1 - 2 * (branch // 2 % 2)
+    elbow = 1 - 2 * (branch % 2)
+    # The arm moves in a vertical plane at the distance d4 from the base's axis.
+    q1 = np.arctan2(y, x) + shoulder * np.arccos(d4 / reach) + np.pi / 2
+    s1, c1 = np.sin(q1), np.cos(q1)
+    cosine = (X[0, 3] * s1 - X[1, 3] * c1 - d4) / d6
+    if abs(cosine) > 1 + 1e-12:
+        return False
+    q5 = wrist * np.arccos(min(max(cosine, -1.0), 1.0))
+    s5 = np.sin(q5)
+    # Components along x and y of frame 6 of the axis of joint 2.
+    along_x = X[0, 0] * s1 - X[1, 0] * c1
+    along_y = X[0, 1] * s1 - X[1, 1] * c1
+    q6 = np.arctan2(-along_y / s5, along_x / s5) if abs(s5) > _SINGULAR_SINE else singular_wrist_3
+    # Origin of frame 4 in the vertical plane, with x along (c1, s1) and y up. From the
+    # origin of frame 5, it is at d5 along y of frame 5, (u, v, w).
+    s6, c6 = np.sin(q6), np.cos(q6)
+    u = X[0, 0] * s6 + X[0, 1] * c6
+    v = X[1, 0] * s6 + X[1, 1] * c6
+    w = X[2, 0] * s6 + X[2, 1] * c6
+    px = (x + d5 * u) * c1 + (y + d5 * v) * s1
+    py = z + d5 * w - d1
+    distance = np.hypot(px, py)
+    cosine = (distance**2 - a2**2 - a3**2) / (2 * a2 * a3)
+    if abs(cosine) > 1 + 1e-12:
+        return False
+    q3 = elbow * np.arccos(min(max(cosine, -1.0), 1.0))
+    # Planar two-link arm; a2 and a3 are negative: links lie along -x of their frames.
+    q2 = np.arctan2(py, px) - np.arctan2(a3 * np.sin(q3), a2 + a3 * np.cos(q3))
+    # Sum of q2, q3 and q4: in the plane, z of frame 4, -(u, v, w), is (sin, -cos) of it.
+    q234 = np.arctan2(-(u * c1 + v * s1), w)
+    q[0] = q1
+    q[1] = q2
+    q[2] = q3
+    q[3] = q234 - q2 - q3
+    q[4] = q5
+    q[5] = q6
+    for joint in range(6):
+        q[joint] = (q[joint] + np.pi) % (2 * np.pi) - np.pi
+    return True
+
+
+@njit(cache=True)
+def _solve_branches(X_B6, singular_wrist_3, d1, a2, a3, d4, d5, d6):  # type: ignore[no-untyped-def]
     """Return the solutions of poses X_B6 (m, 4, 4). Shape (m, 8, 6)."""
     solutions = np.full((len(X_B6), 8, 6), np.nan)
     for k in range(len(X_B6)):
-        X = X_B6[k]
-        # Origin of frame 5.
-        x = X[0, 3] - d6 * X[0, 2]
-        y = X[1, 3] - d6 * X[1, 2]
-        z = X[2, 3] - d6 * X[2, 2]
-        reach = np.hypot(x, y)
-        if reach < abs(d4):
-            continue
         for branch in range(8):
-            shoulder = 1 - 2 * (branch // 4)
-            wrist = 1 - 2 * (branch // 2 % 2)
-            elbow = 1 - 2 * (branch % 2)
-            # The arm moves in a vertical plane at the distance d4 from the base's axis.
-            q1 = np.arctan2(y, x) + shoulder * np.arccos(d4 / reach) + np.pi / 2
-            s1, c1 = np.sin(q1), np.cos(q1)
-            cosine = (X[0, 3] * s1 - X[1, 3] * c1 - d4) / d6
-            if abs(cosine) > 1 + 1e-12:
-                continue
-            q5 = wrist * np.arccos(min(max(cosine, -1.0), 1.0))
-            s5 = np.sin(q5)
-            # Components along x and y of frame 6 of the axis of joint 2.
-            along_x = X[0, 0] * s1 - X[1, 0] * c1
-            along_y = X[0, 1] * s1 - X[1, 1] * c1
-            q6 = (
-                np.arctan2(-along_y / s5, along_x / s5)
-                if abs(s5) > _SINGULAR_SINE
-                else singular_wrist_3
+            solve_branch(
+                X_B6[k], branch, singular_wrist_3, d1, a2, a3, d4, d5, d6, solutions[k, branch]
             )
-            # Origin of frame 4 in the vertical plane, with x along (c1, s1) and y up. From the
-            # origin of frame 5, it is at d5 along y of frame 5, (u, v, w).
-            s6, c6 = np.sin(q6), np.cos(q6)
-            u = X[0, 0] * s6 + X[0, 1] * c6
-            v = X[1, 0] * s6 + X[1, 1] * c6
-            w = X[2, 0] * s6 + X[2, 1] * c6
-            px = (x + d5 * u) * c1 + (y + d5 * v) * s1
-            py = z + d5 * w - d1
-            distance = np.hypot(px, py)
-            cosine = (distance**2 - a2**2 - a3**2) / (2 * a2 * a3)
-            if abs(cosine) > 1 + 1e-12:
-                continue
-            q3 = elbow * np.arccos(min(max(cosine, -1.0), 1.0))
-            # Planar two-link arm; a2 and a3 are negative: links lie along -x of their frames.
-            q2 = np.arctan2(py, px) - np.arctan2(a3 * np.sin(q3), a2 + a3 * np.cos(q3))
-            # Sum of q2, q3 and q4: in the plane, z of frame 4, -(u, v, w), is (sin, -cos) of it.
-            q234 = np.arctan2(-(u * c1 + v * s1), w)
-            q = solutions[k, branch]
-            q[0] = q1
-            q[1] = q2
-            q[2] = q3
-            q[3] = q234 - q2 - q3
-            q[4] = q5
-            q[5] = q6
-            for joint in range(6):
-                q[joint] = (q[joint] + np.pi) % (2 * np.pi) - np.pi
     return solutions

@@ -1,0 +1,258 @@
+"""The inverse reachability map, and the clearances that it checks at exact poses."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import DEFAULT_CELL, cell_with, resting, rng, scene_of
+from numpy.typing import NDArray
+
+from drake_clutter.feasibility.arm_clearance import (
+    ArmGeometry,
+    ObstacleTops,
+    collides_with_itself,
+    collides_with_objects,
+    place_capsules,
+    solve_downward,
+)
+from drake_clutter.feasibility.inverse_reachability import (
+    SPACING,
+    InverseReachabilityMap,
+    MovePoses,
+    find_move_poses,
+    load_inverse_reachability,
+    save_inverse_reachability,
+)
+from drake_clutter.files import InputError
+from drake_clutter.planning.collision_model import CollisionModel
+from drake_clutter.planning.pick_place_plan import PlanningFailure
+from drake_clutter.planning.pick_place_planner import PickPlacePlanner
+from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.planning.tool_kinematics import ToolKinematics, downward_pose
+from drake_clutter.scenes.scene import Pose
+
+Floats = NDArray[np.float64]
+
+NO_TOPS = ObstacleTops.from_scene(scene_of(), np.empty(0))
+
+
+def disk_map(
+    radius: float,
+    *,
+    lowest: float = 0.1,
+    turn: float = 0.0,
+    turn_limits: tuple[float, float] = (-2 * math.pi, 2 * math.pi),
+) -> InverseReachabilityMap:
+    """Return a map in which one solution reaches a disk around the base, at z from 0 to 1 m."""
+    radii = np.arange(0.0, 1.0, SPACING)
+    shape = len(radii), 51, 24
+    solutions = np.zeros(shape, np.uint8)
+    solutions[radii <= radius] = 1 << 3
+    heights = np.full((*shape, 8), lowest, np.float32)
+    turns = np.full((*shape, 8), turn, np.float32)
+    return InverseReachabilityMap(
+        np.arange(51) * np.float64(SPACING),
+        solutions,
+        heights,
+        turns,
+        np.array(turn_limits),
+        ArmGeometry.without_closed_form(),
+    )
+
+
+def move_rows(p_pick: Sequence[float], p_place: Sequence[float], top: float) -> MovePoses:
+    row = (*p_pick[:2], 0.3, *p_place[:2], 0.3, p_pick[2], p_place[2], top)
+    return MovePoses.join([np.array([row])], [0])
+
+
+def reaches(
+    found: InverseReachabilityMap, moves: MovePoses, bases: Sequence[Sequence[float]], table: float
+) -> list[bool]:
+    """Return whether the first move is reachable from each base."""
+    result: list[bool] = found.find_reachable(moves, np.array(bases), table, NO_TOPS)[:, 0].tolist()
+    return result
+
+
+def test_inverse_reachability_of_a_disk() -> None:
+    """A base reaches a move if pick, place and the points above them are in its disk."""
+    moves = move_rows((0.3, 0.0, 0.1), (0.3, 0.4, 0.2), 0.4)
+    bases = [[0.0, 0.2, 0.0], [-0.2, 0.2, 0.0], [0.3, 0.2, 0.15], [0.3, 0.2, -0.7]]
+    # 0.36 m to both; 0.54 m to both; the pick is below the map; the way is above it.
+    found = reaches(disk_map(0.45), moves, [[*base, 0.0] for base in bases], -1.0)
+    assert found == [True, False, False, False]
+
+
+def test_inverse_reachability_keeps_links_above_the_table() -> None:
+    moves = move_rows((0.3, 0.0, 0.1), (0.3, 0.1, 0.2), 0.4)
+    base = [[0.0, 0.0, 0.0, 0.0]]
+    assert reaches(disk_map(0.45, lowest=0.1), moves, base, 0.05) == [True]
+    assert reaches(disk_map(0.45, lowest=0.1), moves, base, 0.096) == [False]
+
+
+def test_the_first_joint_keeps_its_limits() -> None:
+    """It turns by 0.2 rad plus the direction of the tool as the base sees it, in full turns."""
+    moves = move_rows((-0.3, -0.01, 0.1), (-0.3, 0.01, 0.2), 0.4)  # around the direction -x
+    found = disk_map(0.45, turn=0.2, turn_limits=(math.radians(-170), math.radians(170)))
+    yaws = np.radians([0.0, 60.0, 175.0, 190.0, 210.0])
+    # The joint is at 180 + 11.5 deg minus the yaw, give or take 1.9 deg, and 191.5 is -168.5 deg.
+    expected = [False, True, True, True, True]
+    assert reaches(found, moves, [[0.0, 0.0, 0.0, yaw] for yaw in yaws], -1.0) == expected
+    narrow = disk_map(0.45, turn=0.2, turn_limits=(0.0, math.radians(120)))
+    expected = [False, False, True, False, False]
+    assert reaches(narrow, moves, [[0.0, 0.0, 0.0, yaw] for yaw in yaws], -1.0) == expected
+
+
+def test_move_poses_follow_the_object() -> None:
+    """The place poses of the tool differ from the grasp by the move of the object."""
+    planner = PickPlacePlanner(DEFAULT_CELL, PlannerConfig())
+    can = resting("tomato_soup_can", xy=(-0.1, -0.2))
+    grasps = planner.grasps(can)
+    assert not isinstance(grasps, PlanningFailure)
+    place = Pose((0.2, 0.1, can.X_TO.p[2] + 0.05), can.X_TO.quaternion)
+    rows = find_move_poses(can, place, [grasps[0]], planner.config)
+    assert rows.shape == (12, 9)
+    x, y, _, place_x, place_y, _, z, place_z, top = rows.T
+    assert place_x - x == pytest.approx(0.3 * np.ones(12))
+    assert place_y - y == pytest.approx(0.3 * np.ones(12))
+    assert place_z - z == pytest.approx(0.05 * np.ones(12))
+    assert top - place_z == pytest.approx(planner.config.lift_height * np.ones(12))
+    yaws = np.sort(rows[:, 2] % (2 * math.pi))
+    assert np.diff(yaws) == pytest.approx(np.full(11, math.pi / 6))
+    near = [grasps[0], *grasps[:1]]
+    assert len(find_move_poses(can, place, near, planner.config)) == 12, "the same place twice"
+
+
+class Arm:
+    """The default cell's arm with its geometry, alone."""
+
+    def __init__(self, *settings: str) -> None:
+        self.cell = cell_with(*settings)
+        self.name, tool = next(iter(self.cell.gripper.tools.items()))
+        self.tool = ToolKinematics(self.cell, self.name)
+        self.model = CollisionModel(self.cell, ())
+        shapes = self.model.moving_capsules().shapes.tolist()
+        pairs = [(a, b) for k, a in enumerate(shapes) for b in shapes[:k]]
+        self.geometry = ArmGeometry.from_model(self.tool, tool, self.model, pairs)
+
+    def placed(self, q: Floats) -> Floats:
+        """Return the ends of the capsules in the base. Shape (c, 2, 3)."""
+        arm = self.geometry
+        n = len(q)
+        placed = np.empty((len(arm.radii), 2, 3))
+        frames, moved = np.empty((n + 1, 4, 4)), np.empty((n, 3, 4))
+        place_capsules(arm.fixed, np.ones(n, bool), arm.depths, arm.ends, q, frames, moved, placed)
+        return placed
+
+
+def test_solutions_of_a_downward_tool() -> None:
+    arm = Arm("robot.base.yaw=25")
+    X_TB = arm.cell.robot.X_TB
+    base_yaw = math.radians(25)
+    for x, y, z, yaw in ((0.1, 0.2, 0.1, 0.4), (-0.3, 0.0, 0.3, -2.0), (2.0, 0.0, 0.1, 0.0)):
+        p_BG = X_TB.inverse() @ np.array([x, y, z])
+        pose = np.array([*p_BG, yaw - base_yaw])
+        expected = arm.tool.solve_ik(downward_pose(yaw, np.array([x, y, z])))
+        for branch in range(8):
+            q, X = np.empty(6), np.empty((2, 4, 4))
+            found = solve_downward(
+                *(arm.geometry.lengths, arm.geometry.X_0B, arm.geometry.X_G6),
+                *(pose, branch, X, q),
+            )
+            assert found == np.isfinite(expected[branch, 0])
+            if found:
+                # At a full turn, -pi and pi are the same.
+                assert np.cos(q - expected[branch]) == pytest.approx(np.ones(6), abs=1e-9)
+
+
+def test_capsules_are_where_the_collision_model_has_them() -> None:
+    """Pairs of round links are as close as in the collision model; cylinders are shortened."""
+    arm = Arm()
+    links = {"forearm", "wrist_1", "wrist_2", "wrist_3", "upper_arm", "shoulder"}
+    capsules = arm.model.moving_capsules()
+    names = [arm.model.owner_name(shape) for shape in capsules.shapes.tolist()]
+    generator = rng(3)
+    num_close = 0
+    for _ in range(60):
+        q = generator.uniform(-math.pi, math.pi, 6)
+        placed = arm.placed(q)
+        found = arm.model.distances_along(q[None], 0.1)
+        of_links = [
+            (pair, distance)
+            for pair, distance in zip(found.pairs.tolist(), found.distances.tolist(), strict=True)
+            if {arm.model.owner_name(shape) for shape in pair} <= links
+        ]
+        for pair, distance in of_links:
+            index = [capsules.shapes.tolist().index(shape) for shape in pair]
+            pairs = np.array([index])
+            radii = arm.geometry.radii
+            assert collides_with_itself(placed, radii, pairs, distance + 1e-6), names
+            assert not collides_with_itself(placed, radii, pairs, distance - 1e-6), names
+            num_close += 1
+    assert num_close > 50
+
+
+def test_heights_above_a_box() -> None:
+    """A ball of 5 cm rests on the box's top, or 3 cm beside it on its edge."""
+    box = resting("sugar_box")
+    (low_x, low_y, _), (high_x, high_y, top) = box.bounds_T
+    scene = scene_of(box, resting("tomato_soup_can", xy=(0.25, 0.25)))
+    tops = ObstacleTops.from_scene(scene, np.array([0.05]))
+
+    def heights(x: float, y: float) -> tuple[float, int, float]:
+        i, j = np.round((np.array([x, y]) - tops.corner) / 0.005).astype(int)
+        return tops.first[0, i, j], tops.owners[0, i, j], tops.second[0, i, j]
+
+    middle = (low_x + high_x) / 2, (low_y + high_y) / 2
+    assert heights(*middle)[0] == pytest.approx(top + 0.05)
+    assert heights(*middle)[1:] == (0, -math.inf)
+    beside = heights(high_x + 0.03, middle[1])[0]
+    # The grid point is up to 2.5 mm from the position.
+    assert math.sqrt(0.05**2 - 0.0325**2) <= beside - top <= math.sqrt(0.05**2 - 0.0275**2)
+    assert heights(high_x + 0.06, middle[1]) == (-math.inf, -1, -math.inf)
+    assert heights(0.25, 0.25)[1] == 1
+    wall = scene.support.wall_height
+    assert heights(0.0, 0.35)[0] == pytest.approx(wall + 0.05, abs=1e-4)
+
+
+def test_a_capsule_over_a_box() -> None:
+    """Only the object that a tool picks may be touched, and only by the tool."""
+    box = resting("sugar_box")
+    radii = np.array([0.03])
+    tops = ObstacleTops.from_scene(scene_of(box), radii)
+    center = np.array([*(box.bounds_T[0][:2] + box.bounds_T[1][:2]) / 2, box.top_height])
+
+    def collides(height: float, *, may_touch: bool, picked: int, yaw: float = 0.0) -> bool:
+        """Return whether a level capsule does, of which one end is over the box."""
+        end = center + np.array([0.0, 0.0, height - 0.4])
+        placed = np.array([[end, end + np.array([0.3, 0.0, 0.0])]])
+        c, s = math.cos(yaw), math.sin(yaw)
+        placed[..., :2] = placed[..., :2] @ np.array([[c, -s], [s, c]])  # in the turned base
+        fields = tops.first, tops.owners, tops.second, tops.corner
+        base = np.array([0.0, 0.0, 0.4, yaw])
+        return bool(
+            collides_with_objects(placed, radii, base, *fields, np.array([may_touch]), picked)
+        )
+
+    for yaw in (0.0, 1.0):
+        assert collides(0.029, may_touch=False, picked=0, yaw=yaw)
+        assert not collides(0.031, may_touch=False, picked=0, yaw=yaw)
+    assert collides(0.0, may_touch=True, picked=1)
+    assert not collides(0.0, may_touch=True, picked=0)
+
+
+def test_maps_are_read_back(tmp_path: Path) -> None:
+    arm = Arm()
+    written = disk_map(0.3, turn=0.5)
+    written = InverseReachabilityMap(**{**vars(written), "arm": arm.geometry})
+    path = tmp_path / "map.npz"
+    save_inverse_reachability(path, written)
+    read = load_inverse_reachability(path)
+    for name in ("heights", "solutions", "lowest", "turns", "turn_limits"):
+        assert np.array_equal(getattr(read, name), getattr(written, name))
+    for name, values in vars(arm.geometry).items():
+        assert np.array_equal(getattr(read.arm, name), values)
+    np.savez(path, heights=written.heights)
+    with pytest.raises(InputError, match=r"map\.npz: .*expected an inverse reachability map"):
+        load_inverse_reachability(path)
