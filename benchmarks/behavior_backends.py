@@ -20,12 +20,13 @@ from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.resources import resource_path
-from drake_clutter.scenes.interfaces import InconclusiveVerdict, Verdict
+from drake_clutter.scenes.interfaces import InconclusiveVerdict, MoveResult, Verdict
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.scenes.scene_dataset import SceneDataset, load_scene_dataset
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.drake_judge import DrakeJudge
 from drake_clutter.stability.static_judge import StaticStabilityJudge
+from drake_clutter.station.motion_recorder import DEFAULT_RATE
 from drake_clutter.systems.closed_loop import ClosedLoop
 from drake_clutter.systems.image_backend import ImageBackend
 from drake_clutter.systems.scenario import Scenario, make_perception, make_policy
@@ -155,7 +156,7 @@ def _run_closed_loop(case: Case, perception: str) -> list[Line]:
         perceive=make_perception(scenario, scene),
         seed=scenario.seed,
         config=scenario.world,
-        record_motion=True,
+        rate=DEFAULT_RATE,
     )
     policy = make_policy(scenario.agent, scenario.world)
     task = run_episode(loop, policy, max_moves=scenario.max_moves)
@@ -249,8 +250,9 @@ def _trace(
 
 def _move_line(transition: Transition) -> Line:
     outcome = transition.outcome
+    came_off = outcome.result is MoveResult.CAME_OFF  # recorded as placed; the detail says so
     texts = [
-        outcome.result.value,
+        "placed" if came_off else outcome.result.value,
         _recorded_detail(outcome.detail),
         outcome.instability,
         outcome.inconclusive,
@@ -260,9 +262,9 @@ def _move_line(transition: Transition) -> Line:
     parts = {"poses": _pose_numbers(outcome.scene.poses.values())}
     if outcome.X_TO_released is not None:
         parts["released"] = _pose_numbers([outcome.X_TO_released])
-    arms = [sample.arm for sample in outcome.motion if sample.arm is not None]
-    if arms:
-        parts |= {"q_middle": [*arms[len(arms) // 2].q], "q_last": [*arms[-1].q]}
+    if outcome.samples is not None:
+        q = outcome.samples.q.tolist()
+        parts |= {"q_middle": q[len(q) // 2], "q_last": q[-1]}
     return Line(words, parts)
 
 

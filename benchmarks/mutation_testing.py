@@ -112,7 +112,7 @@ TESTS = (
     "shelf",
     "images",
     "image_backend",
-    "trajectory_file",
+    "hdf5_file",
     "clutter_station",
     "body_sleep",
     "bellows",

@@ -89,11 +89,16 @@ from .planning.planner_config import PlannerConfig as PlannerConfig
 from .station.arm_executor import ArmExecutor as ArmExecutor
 from .station.clutter_station import ClutterStation as ClutterStation
 from .station.station_simulation import StationSimulation as StationSimulation
-from .station.trajectory_file import (
-    read_trajectories as read_trajectories,
-    write_trajectories as write_trajectories,
-)
 from .feasibility.move_study import FeasibilityStudy as FeasibilityStudy
+
+# Recorded episodes.
+from .recording.episode_recorder import record_episode as record_episode
+from .recording.hdf5_file import load_episode as load_episode, save_episode as save_episode
+from .recording.recorded_episode import (
+    RecordedAction as RecordedAction,
+    RecordedEpisode as RecordedEpisode,
+)
+from .scenes.action_samples import ActionSamples as ActionSamples
 
 # The closed loop.
 from .systems.closed_loop import ClosedLoop as ClosedLoop

@@ -31,15 +31,15 @@ def main(out: Path) -> None:
     for segment in plan.segments:
         print(f"{segment.name}: {segment.duration:.2f} s")
 
-    result = StationSimulation(cell, scene).execute(plan, record=True)
+    result = StationSimulation(cell, scene, rate=40.0).execute(plan)
     print(f"simulated: {result}; largest load {result.max_load_ratio:.0%} of what the cup bears")
 
-    arms = [sample.arm for sample in result.motion if sample.arm is not None]
-    rows = [(*arm.q, *arm.v, *arm.torque, bool(arm.tool)) for arm in arms]
-    times = [sample.time for sample in result.motion]
+    samples = result.samples
+    assert samples is not None
+    rows = [samples.time, samples.q, samples.v, samples.torque, samples.tool_commanded >= 0]
     out.parent.mkdir(parents=True, exist_ok=True)
-    np.savetxt(out, np.column_stack([times, rows]), "%.5f", delimiter=",")
-    print(f"{out}: {len(rows)} samples of time, q, v, torque and vacuum")
+    np.savetxt(out, np.column_stack(rows), "%.5f", delimiter=",")
+    print(f"{out}: {len(samples)} samples of time, q, v, torque and vacuum")
 
 
 if __name__ == "__main__":

@@ -38,10 +38,12 @@ def main() -> None:
         PlanStep("turn back", back),
     )
     plan = plan_from_steps(CellState(tuple(home), scene.objects), steps)
-    result = StationSimulation(cell, scene).execute(plan, record=True)
-    for sample in result.motion[:: len(result.motion) // 8]:
-        assert sample.arm is not None
-        print(f"{sample.time:.2f} s: joint 1 at {sample.arm.q[0]:.3f} rad, cup {sample.arm.tool}")
+    result = StationSimulation(cell, scene, rate=40.0).execute(plan)
+    samples = result.samples
+    assert samples is not None
+    for k in range(0, len(samples), len(samples) // 8):
+        cup = ["large", "small", "none"][samples.tool_commanded[k]]
+        print(f"{samples.time[k]:.2f} s: joint 1 at {samples.q[k, 0]:.3f} rad, cup {cup}")
     print(f"largest tracking error {1000 * result.max_tracking_error:.1f} mrad")
 
 

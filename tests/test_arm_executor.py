@@ -33,7 +33,7 @@ from drake_clutter.reports.filmstrip import (
     rotation_to_base_side,
     select_key_frames,
 )
-from drake_clutter.reports.recording import write_recording
+from drake_clutter.reports.recording import motion_frames, write_recording
 from drake_clutter.scenes.interfaces import Move, MoveResult
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.station.arm_executor import ArmExecutor, evaluate_outcome
@@ -102,13 +102,15 @@ def test_the_small_cup_moves_a_marker_between_others() -> None:
     plan = PickPlacePlanner(DEFAULT_CELL, PlannerConfig()).plan(markers, "middle", place)
     assert isinstance(plan, PickPlacePlan)
     assert plan.tool == "small"
-    simulation = StationSimulation(DEFAULT_CELL, scene_of(*markers))
-    result = simulation.execute(plan, record=True)
+    simulation = StationSimulation(DEFAULT_CELL, scene_of(*markers), rate=40.0)
+    result = simulation.execute(plan)
     assert result.grasped
     assert not result.lost_object
     assert result.position_error < 0.003
     assert max(result.displacements.values()) < 0.001
-    assert {sample.arm.tool for sample in result.motion if sample.arm} == {"", "small"}
+    assert result.samples is not None
+    small = [*DEFAULT_CELL.gripper.tools].index("small")
+    assert {*result.samples.tool_commanded.tolist()} == {-1, small}
     assert simulation.gripper.status.tool == "small"
 
 
@@ -142,9 +144,9 @@ def test_an_object_is_not_lifted_without_a_seal(plan: PickPlacePlan) -> None:
 
 
 @pytest.mark.parametrize(
-    ("xy", "result"), [((0.2, -0.2), MoveResult.PLACED), ((0.2, 0.0), MoveResult.DROPPED)]
+    ("xy", "result"), [((0.2, -0.2), MoveResult.CAME_OFF), ((0.2, 0.0), MoveResult.DROPPED)]
 )
-def test_an_object_that_comes_off_at_its_place_pose_is_placed(
+def test_an_object_that_comes_off_at_its_place_pose_is_not_dropped(
     xy: tuple[float, float], result: MoveResult, config: ClutterConfig
 ) -> None:
     """The impact at touchdown may break the seal just before the vacuum is switched off."""
@@ -353,19 +355,21 @@ def test_moves_are_executed_or_refused_with_a_reason(
     assert placed.scene["pudding_box"].X_TO.p == pytest.approx(
         scene["pudding_box"].X_TO.p, abs=0.002
     )
-    assert placed.motion
+    assert placed.samples is not None
     for name, why in (("large_marker", "no seal"), ("pudding_box", "carries others")):
         outcome = executed(executor, scene, observation, Move(name), rng())
         assert outcome.result is MoveResult.NOT_PLANNED
         assert outcome.detail.startswith(why)
+        assert outcome.failure_reason == why
         assert outcome.scene == scene
         assert not outcome.result.was_executed
 
 
 def test_images_and_recordings_show_the_arm(plan: PickPlacePlan, tmp_path: Path) -> None:
-    motion = StationSimulation(DEFAULT_CELL, SCENE).execute(plan, record=True).motion
-    assert motion[0].arm is not None
-    assert motion[0].arm.q == pytest.approx(DEFAULT_CELL.robot.home, abs=0.01)
+    samples = StationSimulation(DEFAULT_CELL, SCENE, rate=40.0).execute(plan).samples
+    assert samples is not None
+    motion = motion_frames(samples, SCENE.names)
+    assert motion[0].q == pytest.approx(DEFAULT_CELL.robot.home, abs=1e-6)
     moments = select_key_frames(motion, "sugar_box")
     times = [frame.time for frame in moments]
     assert times == sorted(times)
@@ -380,7 +384,7 @@ def test_images_and_recordings_show_the_arm(plan: PickPlacePlan, tmp_path: Path)
     write_recording(
         tmp_path / "without.html",
         SCENE,
-        [replace(frame, arm=None) for frame in motion[::8]],
+        [replace(frame, q=()) for frame in motion[::8]],
         DEFAULT_CELL,
     )
     with_arm, without = ((tmp_path / f"{name}.html").stat().st_size for name in ("with", "without"))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from conftest import DEFAULT_CELL, resting, scene_of
+from conftest import DEFAULT_CELL, ONE_CUP, cell_with, resting, scene_of
 from typer.testing import CliRunner
 
 from drake_clutter.catalog import load_catalog
@@ -14,9 +14,9 @@ from drake_clutter.cli import app
 from drake_clutter.cli.config_from_options import load_config_from_options
 from drake_clutter.cli.run import _load_scenario
 from drake_clutter.files import InputError
+from drake_clutter.recording.hdf5_file import load_episode
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.scene_file import load_scene, save_scene
-from drake_clutter.station.trajectory_file import read_trajectories
 from drake_clutter.validation import config_yaml, to_plain, validate
 
 UR5E = resource_path("models/cells/ur5e_epick_tray.yaml")
@@ -54,13 +54,18 @@ def test_a_move_uses_and_stores_the_cell_of_the_scene(scene_file: Path, tmp_path
         out,
     )
     expected = load_cell(UR5E).with_support(SCENE.support)
-    _, cell, moves = read_trajectories(out / "trajectory.h5", load_catalog())
-    assert cell == expected
-    assert len(moves) == 1
+    recorded = load_episode(out / "trajectory.h5", load_catalog())
+    assert recorded.cell == expected
+    (action,) = recorded.actions
+    assert action.samples is not None
     assert load_scene(out / "after.yaml", load_catalog()).cell == expected
     episode = json.loads((out / "episode.json").read_text())
     assert validate(WorkCell, episode["cell"], "episode.json") == expected
-    assert episode["moves"][0]["outcome"] == "placed"
+    assert episode["moves"][0]["outcome"] == action.result.value == "placed"
+    assert (episode["trajectory"], episode["moves"][0]["action"]) == (
+        "trajectory.h5",
+        "action_0001",
+    )
 
 
 def test_options_replace_the_cell_of_the_scene_except_its_support(
@@ -203,3 +208,29 @@ def test_a_study_refuses_cells_with_the_same_name(scene_file: Path, tmp_path: Pa
         match="--cell, --cell-override: ur5e_epick_tray occurs twice; expected unique file",
     ):
         run("feasibility", scene_file, "--cell", UR5E, "--cell", other, "--out", tmp_path / "out")
+
+
+def test_plans_alone_from_the_command_line(tmp_path: Path) -> None:
+    """The small gripper does not hold the marker."""
+    cell = cell_with(ONE_CUP)
+    scene = scene_of(
+        resting("pudding_box"),
+        resting("gelatin_box", floor=0.035),
+        resting("large_marker", xy=(0.2, 0.2)),
+    )
+    save_scene(tmp_path / "scene.yaml", scene, cell)
+    moves = tmp_path / "moves.yaml"
+    moves.write_text("[{pick: gelatin_box, place: tray}, {pick: large_marker, place: tray}]")
+    options = ("--fidelity", "arm", "--plan-only", "--out", tmp_path / "plans")
+    run("move", tmp_path / "scene.yaml", "--moves", moves, *options)
+    planned, failed = json.loads((tmp_path / "plans" / "plan.json").read_text())["plans"]
+    assert planned["planned"]
+    assert [segment["name"] for segment in planned["segments"]] == ["approach", "carry", "retreat"]
+    assert planned["segments"][0]["q"][0] == pytest.approx(cell.robot.home)
+    assert len(planned["segments"][1]["q"]) == len(planned["segments"][1]["time"])
+    assert (failed["planned"], failed["reason"], failed["detail"]) == (
+        False,
+        "no seal",
+        "large_marker",
+    )
+    assert failed["value"] is None, "its lip would be partly in the air"

@@ -239,7 +239,7 @@ def test_a_closed_loop_episode(config: ClutterConfig, tmp_path: Path) -> None:
             return Decision(Move("large_marker"))
         return largest_clear(belief, observation, rng)
 
-    loop = ClosedLoop(scene, seed=0, config=config, record_motion=True)
+    loop = ClosedLoop(scene, seed=0, config=config, rate=40.0)
     task = run_episode(loop, marker_first, max_moves=4)
     timing = loop.timing
     results = [step.outcome.result for step in task.transitions]
@@ -247,8 +247,9 @@ def test_a_closed_loop_episode(config: ClutterConfig, tmp_path: Path) -> None:
     assert task.transitions[0].outcome.detail == "no seal: large_marker"
     placed = task.transitions[1]
     assert (placed.move, placed.newly_found) == (Move("cracker_box"), ("gelatin_box",))
-    assert placed.outcome.motion[0].arm is not None
-    assert max(frame.time for frame in placed.outcome.motion) > 2
+    assert placed.outcome.samples is not None
+    assert placed.outcome.samples.time[-1] > 2
+    assert np.abs(placed.outcome.samples.v[[0, -1]]).max() < 1e-3, "at rest at both ends"
     assert task.termination is TerminationReason.ALL_FOUND
     assert names == ["cracker_box,large_marker"] * 2 + ["cracker_box,large_marker,gelatin_box"]
     assert 3 < timing.simulated < 15
@@ -278,17 +279,17 @@ def test_a_closed_loop_episode_with_another_arm(
         resting("cracker_box", xy=(0.1, 0.0), floor=0.028),
     )
     scene = Scene(objects, cell.support)  # Each arm reaches its own tray.
-    loop = ClosedLoop(scene, seed=0, config=replace(config, cell=cell), record_motion=True)
+    loop = ClosedLoop(scene, seed=0, config=replace(config, cell=cell), rate=40.0)
     task = run_episode(loop, largest_clear, max_moves=1)
     (step,) = task.transitions
     assert (step.outcome.result, task.termination) == (
         MoveResult.PLACED,
         TerminationReason.ALL_FOUND,
     )
-    arm = step.outcome.motion[0].arm
-    assert arm is not None
-    assert len(arm.q) == joints
-    assert arm.q == pytest.approx(cell.robot.home, abs=0.01)
+    samples = step.outcome.samples
+    assert samples is not None
+    assert samples.q.shape[1] == joints
+    assert samples.q[0] == pytest.approx(cell.robot.home, abs=1e-6)
 
 
 def test_the_last_allowed_move_can_reveal_all_objects(config: ClutterConfig) -> None:

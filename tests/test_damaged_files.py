@@ -28,11 +28,12 @@ from conftest import DEFAULT_CELL, TRAY, rng
 from feasibility_jobs import feasibility_job
 from PIL import Image
 from pydrake.systems.framework import DiagramBuilder
+from recorded_episodes import synthetic_episode
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from test_collision_filters import arm
 from test_mesh_file import write_cube_with_seams
-from test_scene_file import DOCUMENT, SCENE
+from test_scene_file import DOCUMENT
 from test_scene_file_fuzzed import SCENARIO, places
 from test_station_simulation import STATIC
 
@@ -76,16 +77,15 @@ from drake_clutter.perception.image_dataset import (
 )
 from drake_clutter.perception.segmentation import CHECKPOINT_KIND, SegmentationNetwork
 from drake_clutter.planning.collision_model import CollisionModel
+from drake_clutter.recording.hdf5_file import load_episode, save_episode
 from drake_clutter.records import read_jsonl, resume_jsonl, write_jsonl
 from drake_clutter.resources import resource_path
 from drake_clutter.robots.model_parsing import read_model_text, read_torque_limits
 from drake_clutter.robots.robot_model import load_robot
-from drake_clutter.scenes.interfaces import ArmState, MotionSample, Move, MoveResult, Outcome
 from drake_clutter.scenes.scene import Pose
 from drake_clutter.scenes.scene_dataset import _digest, load_scene_dataset
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.simulation.scene_plant import add_scene_plant
-from drake_clutter.station.trajectory_file import read_trajectories, write_trajectories
 from drake_clutter.systems.scenario import Scenario
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.tasks.generation_task import ClutterGeneration, GenerationTaskConfig
@@ -220,7 +220,7 @@ def damage_hdf5(path: Path, generator: np.random.Generator) -> None:
     with h5py.File(path, "r+") as file:
         owners = [file, *(file[name] for name in file)]
         owner = owners[int(generator.integers(len(owners)))]
-        if generator.random() < 0.5 and len(owner.attrs):
+        if len(owner.attrs) and (not len(owner) or generator.random() < 0.5):
             name = str(generator.choice(sorted(owner.attrs)))
             value = owner.attrs[name]
             del owner.attrs[name]
@@ -334,11 +334,14 @@ def detector_checkpoint(folder: Path) -> Reader:
 
 def trajectory_file(folder: Path) -> Reader:
     path = folder / "trajectory.h5"
-    arm = ArmState((0.1,) * 6, (0.0,) * 6, (1.0,) * 6, "single")
-    motion = tuple(MotionSample(0.1 * k, SCENE.poses, arm) for k in range(3))
-    outcome = Outcome(MoveResult.PLACED, SCENE, motion=motion)
-    write_trajectories(path, SCENE, [(Move(SCENE.names[0]), outcome)], DEFAULT_CELL)
-    return Reader([path], lambda: read_trajectories(path, CATALOG))
+    path.write_bytes((Path(__file__).parent / "data/trajectory_v1.h5").read_bytes())
+    return Reader([path], lambda: load_episode(path, CATALOG))
+
+
+def recorded_episode(folder: Path) -> Reader:
+    path = folder / "episode.h5"
+    save_episode(path, synthetic_episode(rate=10.0, cameras={"overhead": 10}))
+    return Reader([path], lambda: load_episode(path, CATALOG))
 
 
 def exploration() -> ClutterExploration:
@@ -611,7 +614,8 @@ def robot_files(folder: Path) -> Reader:
 READERS = [
     *(mesh_files, visual_files, own_catalog, robot_files),
     *(scene_file, config_file, cell_file, generator_checkpoint, explorer_checkpoint),
-    *(detector_checkpoint, trajectory_file, soft_q_training, ppo_training, cloning_training),
+    *(detector_checkpoint, trajectory_file, recorded_episode),
+    *(soft_q_training, ppo_training, cloning_training),
     *(job_file, progress_file, scene_dataset, image_dataset, record_file, results_file),
     feasibility_parts,
 ]

@@ -152,7 +152,7 @@ def replace_dataset(file: h5py.Group, name: str, values: np.ndarray) -> None:
     ("damage", "message"),
     [
         (set_rate, r"rate: .*-1.0.*; expected a number in \(0, 1000\]"),
-        (lambda f: f.attrs.update({"version": 3}), "version: 3; expected 2"),
+        (lambda f: f.attrs.update({"version": 3}), r"version: 3; expected an integer in \[1, 2\]"),
         (lambda f: f.attrs.__delitem__("policy"), "policy: is missing; expected a text"),
         (lambda f: f.move("action_0001", "action_0003"), "expected .*'action_0001', 'action_0002'"),
         (

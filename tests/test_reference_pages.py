@@ -3,8 +3,10 @@
 import re
 from pathlib import Path
 
+import h5py
 import numpy as np
 from conftest import DEFAULT_CELL, resting, scene_of
+from recorded_episodes import synthetic_episode
 from test_floors import FLOORS
 
 from drake_clutter import ClutterConfig, run_episode
@@ -14,9 +16,10 @@ from drake_clutter.feasibility.move_study import MOVE_RECORD_FIELDS
 from drake_clutter.feasibility.pose_noise import NOISE_RECORD_FIELDS
 from drake_clutter.feasibility.sequences import SEQUENCE_RECORD_FIELDS
 from drake_clutter.planning.pick_place_plan import PlanningFailureReason
+from drake_clutter.recording.hdf5_file import save_episode
+from drake_clutter.scenes.action_samples import CHANNELS
 from drake_clutter.scenes.interfaces import MoveResult
 from drake_clutter.scenes.scene_file import scene_to_dict
-from drake_clutter.station import trajectory_file
 from drake_clutter.tasks.episode import make_teleport_backend_factory
 from drake_clutter.tasks.exploration_task import TerminationReason
 
@@ -60,9 +63,16 @@ def test_scene_file() -> None:
     assert {*written["objects"][0]} <= {"name", "class", "X_TO", "node"}
 
 
-def test_trajectory_file() -> None:
-    documented = re.findall(r"^    (\w+) +\(m", trajectory_file.__doc__ or "", re.MULTILINE)
-    assert first_column("reference/trajectory_file.md", "## Groups") == documented
+def test_trajectory_file(tmp_path: Path) -> None:
+    page, path = "reference/trajectory_file.md", tmp_path / "episode.h5"
+    save_episode(path, synthetic_episode(cameras={"overhead": 10}))
+    assert first_column(page, "## Datasets of an action") == [c.name for c in CHANNELS]
+    with h5py.File(path) as stored:
+        assert {*first_column(page, "## Attributes of the file")} == {*stored.attrs}
+        action = next(group for group in stored.values() if "images" in group)
+        assert {*first_column(page, "## Attributes of an action")} == {*action.attrs}
+        assert {*action} == {*(c.name for c in CHANNELS), "X_WG", "images"}
+        assert {*action["images/overhead"]} <= {*first_column(page, "## Images")}
 
 
 def test_feasibility_study() -> None:

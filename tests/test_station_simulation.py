@@ -3,27 +3,30 @@
 import gc
 import math
 import weakref
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 from conftest import DEFAULT_CELL, cell_with, resting, scene_of
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, EventStatus
 
-from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.fixture import Fixture
 from drake_clutter.cell.pose_spec import PoseSpec
+from drake_clutter.cell.suction import SuctionGripper
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.files import InputError
 from drake_clutter.planning.collision_model import CollisionModel
+from drake_clutter.planning.motion_plan import Plan
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.reports import recording
+from drake_clutter.reports.recording import motion_frames
 from drake_clutter.resources import resource_path
-from drake_clutter.scenes.interfaces import MotionSample, Move, MoveResult, Outcome
+from drake_clutter.robots.robot_model import load_robot
+from drake_clutter.scenes.action_samples import PHASES, ActionSamples
 from drake_clutter.scenes.scene import Pose
 from drake_clutter.simulation.scene_plant import pose_from_transform
 from drake_clutter.station.clutter_station import ClutterStation
@@ -35,8 +38,6 @@ from drake_clutter.station.station_simulation import (
     StationSimulation,
     simulate_plan,
 )
-from drake_clutter.station.trajectory_file import read_trajectories, write_trajectories
-from drake_clutter.validation import config_yaml
 
 SCENE = scene_of(resting("pudding_box"), resting("gelatin_box", xy=(0.15, 0.1)))
 CELL = cell_with(
@@ -70,47 +71,113 @@ def link_poses(simulation: StationSimulation) -> dict[str, Pose]:
     }
 
 
-def is_past(simulation: StationSimulation, time: float) -> bool:
-    return bool(simulation.root.get_time() > time)
+def recorded(simulation: StationSimulation, plan: Plan) -> ActionSamples:
+    """Return the samples of a plan."""
+    samples = simulation.execute(plan).samples
+    assert samples is not None
+    return samples
 
 
-def test_recordings_show_the_arm_at_its_simulated_poses(tmp_path: Path) -> None:
-    simulation, motion, simulated = StationSimulation(CELL, SCENE), list[MotionSample](), []
-    context = simulation.executor.GetMyMutableContextFromRoot(simulation.root)
-    simulation.executor.GetInputPort("plan").FixValue(context, PlannedMove(1, planned()))
-    for end in (0.4, 0.8, 1.2):
-        simulation.run_until(partial(is_past, simulation, end))
-        motion.append(simulation.sample())
-        simulated.append(link_poses(simulation))
-    outcome = Outcome(MoveResult.PLACED, SCENE, motion=tuple(motion))
-    path = tmp_path / "trajectory.h5"
-    write_trajectories(path, SCENE, [(Move("pudding_box"), outcome)], CELL)
-    scene, cell, ((_, frames),) = read_trajectories(path, load_catalog())
-    assert cell == CELL
-    _, _, drawn_at = recording._build_viewer(scene, cell, arm=True)
-    for frame, poses in zip(frames, simulated, strict=True):
-        assert frame.arm is not None
-        drawn = drawn_at(frame.arm.q)
-        for name, X_TL in poses.items():
-            assert drawn[name].p == pytest.approx(X_TL.p, abs=1e-9)
-            assert drawn[name].rotation == pytest.approx(X_TL.rotation, abs=1e-9)
-    ends = [poses["epick::body"].p for poses in (simulated[0], simulated[-1])]
+class Watch:
+    """Compares the samples of a recorder with the plant at the same times."""
+
+    def __init__(self, simulation: StationSimulation, times: Sequence[float]) -> None:
+        self.simulation = simulation
+        self.times = [*times]
+        self.q = list[np.ndarray]()
+        self.links = list[dict[str, Pose]]()
+        self.objects = list[dict[str, Pose]]()
+
+    def __call__(self, root: Context) -> EventStatus:
+        assert self.simulation.recorder is not None
+        self.simulation.recorder.observe(root)
+        if self.times and root.get_time() >= self.times[0] - 1e-9:
+            assert root.get_time() == pytest.approx(self.times.pop(0), abs=1e-9)
+            context = self.simulation.plant_context
+            self.q.append(self.simulation.station.joint_positions(context))
+            self.links.append(link_poses(self.simulation))
+            self.objects.append(self.simulation.scene.poses)
+        return EventStatus.DidNothing()
+
+
+def test_samples_are_states_of_the_plant_at_their_times() -> None:
+    times = (0.4, 0.8, 1.2)
+    simulation = StationSimulation(CELL, SCENE, rate=40.0)
+    watch = Watch(simulation, times)
+    simulation.simulator.set_monitor(watch)
+    samples = recorded(simulation, planned())
+    indices = [round(40 * time) for time in times]
+    assert samples.time[indices] == pytest.approx(times)
+    assert samples.q[indices] == pytest.approx(np.array(watch.q), abs=1e-12)
+    frames = motion_frames(samples, SCENE.names)
+    _, _, drawn_at = recording._build_viewer(SCENE, CELL, arm=True)
+    for index, links, objects in zip(indices, watch.links, watch.objects, strict=True):
+        for name, X_TL in links.items():
+            drawn = drawn_at(frames[index].q)[name]
+            assert drawn.p == pytest.approx(X_TL.p, abs=1e-9)
+            assert drawn.rotation == pytest.approx(X_TL.rotation, abs=1e-9)
+        for name, X_TO in objects.items():
+            assert frames[index].poses[name].p == pytest.approx(X_TO.p, abs=1e-12)
+            assert frames[index].poses[name].rotation == pytest.approx(X_TO.rotation, abs=1e-9)
+    ends = [poses["epick::body"].p for poses in (watch.links[0], watch.links[-1])]
     assert np.linalg.norm(ends[1] - ends[0]) > 0.1, "it moved meanwhile"
 
 
+def test_samples_tell_what_happens() -> None:
+    """Commands, phases, grasp and contacts of a move, at a rate that the time step divides not."""
+    samples = recorded(StationSimulation(CELL, SCENE, rate=125.0), planned())
+    assert samples.time == pytest.approx(np.arange(len(samples)) / 125)
+    for end in (0, -1):
+        assert np.abs(samples.v[end]).max() < 1e-4, "at rest at both ends"
+        assert samples.q[end] == pytest.approx(CELL.robot.home, abs=1e-4)
+    assert samples.torque[0] == pytest.approx(samples.torque_commanded[0])
+    # The plant follows the command of the step before.
+    delayed = [
+        np.interp(samples.time - samples.time_step, samples.time, column)
+        for column in samples.q_commanded.T
+    ]
+    assert np.abs(samples.q - np.column_stack(delayed)).max() < 1e-3
+    slope = np.gradient(samples.q, samples.time, axis=0)[1:-1]
+    assert np.abs(slope - samples.v[1:-1]).max() < 0.05
+    assert np.abs(samples.v).max() > 0.5
+    limits = load_robot(CELL.robot)
+    assert (np.abs(samples.v) <= 1.01 * limits.velocity_limits).all()
+    assert (np.abs(samples.torque) <= 1.01 * limits.torque_limits).all()
+    order = [PHASES[k] for k in samples.phase[np.flatnonzero(np.diff(samples.phase, prepend=-9))]]
+    assert order == ["approach", "grasp", "carry", "release", "retreat", "idle"]
+    on, off = np.flatnonzero(np.diff(samples.tool_commanded))
+    attached, released = np.flatnonzero(np.diff(samples.held_object))
+    assert on < attached < off <= released
+    assert samples.held_object[attached + 1] == SCENE.names.index("pudding_box")
+    assert isinstance(CELL.gripper, SuctionGripper)
+    full = CELL.gripper.full_vacuum
+    assert samples.vacuum[on, 0] == 0
+    assert samples.vacuum[off, 0] == pytest.approx(full, rel=0.05)
+    carried = (attached + released) // 2
+    held = samples.X_TO[carried, SCENE.names.index("pudding_box")]
+    assert np.linalg.norm(held[4:] - samples.X_TG[carried, 4:]) < 0.03, "half its height"
+    assert not samples.object_contact[carried]
+    assert samples.object_contact[attached + 2], "it stands until it is lifted"
+    assert not samples.tool_contact[[0, -1]].any()
+    assert samples.gripper[carried, 0] > 1e-4, "the bellows carry it"
+
+
 def test_a_reset_simulation_repeats_itself() -> None:
-    plan, simulation = planned(), StationSimulation(CELL, SCENE)
-    first = simulation.execute(plan, record=True)
+    plan, simulation = planned(), StationSimulation(CELL, SCENE, rate=40.0)
+    first = simulation.execute(plan)
     simulation.reset(SCENE)
     assert simulation.root.get_time() == 0.0
     assert simulation.scene["pudding_box"].X_TO.p == pytest.approx(SCENE["pudding_box"].X_TO.p)
-    again = simulation.execute(plan, record=True)
+    again = simulation.execute(plan)
     assert again.poses == first.poses
-    assert again.motion == first.motion
+    assert first.samples is not None
+    assert again.samples is not None
+    for name, values in again.samples.channels().items():
+        np.testing.assert_array_equal(values, first.samples.channels()[name])
 
 
 def test_plans_are_executed_one_after_the_other() -> None:
-    simulation = StationSimulation(CELL, SCENE)
+    simulation = StationSimulation(CELL, SCENE, rate=40.0)
     first = simulation.execute(planned())
     assert (simulation.finished_plan, simulation.is_executing, first.lost_object) == (
         1,
@@ -121,30 +188,24 @@ def test_plans_are_executed_one_after_the_other() -> None:
     planner = PickPlacePlanner(CELL, PlannerConfig(optimize=False))
     plan = planner.plan(simulation.scene.objects, "pudding_box", place)
     assert isinstance(plan, PickPlacePlan)
-    second = simulation.execute(plan, record=True)
+    second = simulation.execute(plan)
     assert simulation.finished_plan == 2
     assert second.poses["pudding_box"].p[:2] == pytest.approx(place.p[:2], abs=0.003)
-    assert 0 < second.motion[0].time <= 2 * STEP_PERIOD
-    assert second.motion[-1].time == pytest.approx(
-        second.simulated_time - simulation.executor_state.start_time
-    )
+    assert second.samples is not None
+    assert second.samples.time[0] == 0
+    assert np.abs(second.samples.v[0]).max() < 1e-4
+    executed = second.simulated_time - simulation.executor_state.start_time
+    assert executed - STEP_PERIOD < second.samples.time[-1] <= executed
 
 
 def test_an_arm_with_seven_joints_executes_a_plan(tmp_path: Path) -> None:
     cell = load_cell(resource_path("models/cells/iiwa14_epick_tray.yaml"))
-    result = StationSimulation(cell, SCENE).execute(planned(cell), record=True)
+    result = StationSimulation(cell, SCENE, rate=40.0).execute(planned(cell))
     assert result.poses["pudding_box"].p[:2] == pytest.approx([0.0, -0.2], abs=0.005)
     assert result.max_tracking_error < 0.02
-    outcome, path = Outcome(MoveResult.PLACED, SCENE, motion=result.motion), tmp_path / "t.h5"
-    write_trajectories(path, SCENE, [(Move("pudding_box"), outcome)], cell)
-    _, read, ((_, frames),) = read_trajectories(path, load_catalog())
-    assert read == cell.with_support(SCENE.support)
-    assert frames[0].arm is not None
-    assert frames[0].arm.q == pytest.approx(cell.robot.home, abs=0.01)
-    with h5py.File(path, "a") as file:
-        file.attrs["cell"] = config_yaml(CELL)
-    with pytest.raises(InputError, match=r"move_0001\.q; expected a dataset of shape \('n', 6\)"):
-        read_trajectories(path, load_catalog())
+    assert result.samples is not None
+    assert result.samples.q.shape[1] == 7
+    assert result.samples.q[0] == pytest.approx(cell.robot.home, abs=1e-6)
 
 
 BOARD = """<robot name="board"><link name="top">
@@ -236,12 +297,14 @@ def test_a_move_simulated_with_few_movable_objects_ends_at_the_same_poses() -> N
     """The coarse simulation stands for an uneventful move."""
     plan, full = planned(), StationSimulation(CELL, SCENE)
     exact = full.execute(plan)
-    result = simulate_plan(CELL, SCENE, plan, record=True)
+    result = simulate_plan(CELL, SCENE, plan, rate=40.0)
     assert result.is_uneventful
     assert result.simulated_time == pytest.approx(exact.simulated_time, abs=1e-9)
     for name, X_TO in exact.poses.items():
         assert result.poses[name].p == pytest.approx(X_TO.p, abs=2e-4)
-        assert result.motion[-1].poses[name] == result.poses[name]
+        assert result.samples is not None
+        last = result.samples.X_TO[-1, SCENE.names.index(name)]
+        assert last[4:] == pytest.approx(result.poses[name].p, abs=1e-6)
     assert result.max_load_ratio == pytest.approx(exact.max_load_ratio, abs=0.2)
 
 

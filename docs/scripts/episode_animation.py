@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from drake_clutter import load_catalog, read_trajectories
+from drake_clutter import load_catalog, load_episode
 from drake_clutter.reports.filmstrip import render_filmstrip
+from drake_clutter.reports.recording import motion_frames
 
-STRIDE = 8
-"""Samples of the recording, 25 ms apart, per picture."""
+RATE = 5.0
+"""Pictures per second of the recording."""
 PICTURE_DURATION = 80
 """Time for which a picture is shown [ms]."""
 LAST_DURATION = 1500
@@ -27,9 +28,11 @@ COLORS = 80
 
 def main(trajectory: Path, animation: Path) -> None:
     """Write a GIF of all moves of a recording."""
-    scene, cell, moves = read_trajectories(trajectory, load_catalog())
-    samples = [s for _, motion in moves for s in (*motion[::STRIDE], motion[-1])]
-    strip = render_filmstrip(scene, samples, cell, 480)
+    episode = load_episode(trajectory, load_catalog())
+    scene = episode.initial_scene
+    motions = [action.samples for action in episode.actions if action.samples is not None]
+    samples = [s for motion in motions for s in motion_frames(motion, scene.names, RATE)]
+    strip = render_filmstrip(scene, samples, episode.cell, 480)
     size = strip.shape[0]
     pictures = [
         Image.fromarray(strip[:, k * size : (k + 1) * size]).crop(CROP) for k in range(len(samples))

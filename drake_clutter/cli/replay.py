@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from drake_clutter.cli.options import CatalogOption, HtmlOption
-from drake_clutter.cli.output import out_console, show_recording
+from drake_clutter.cli.output import out_console, print_line, progress_bar, show_recording
 from drake_clutter.files import InputError
 
 
@@ -14,21 +14,43 @@ def replay(
     file: Annotated[
         Path,
         typer.Argument(
-            metavar="FILE.h5", help="Recorded motions (`trajectory.h5`) of `--fidelity arm`."
+            metavar="FILE.h5",
+            help="Recorded episode: `trajectory.h5` of `--fidelity arm`, or a file of a data set.",
         ),
     ],
+    speed: Annotated[
+        float, typer.Option(min=0.01, max=100.0, help="Times faster than recorded.")
+    ] = 1.0,
     html_file: HtmlOption = None,
+    mp4_file: Annotated[
+        Path | None, typer.Option("--mp4", metavar="FILE", help="Write a video instead.")
+    ] = None,
     catalog: CatalogOption = None,
 ) -> None:
-    """Replay recorded arm motions in the browser (Meshcat)."""
+    """Replay recorded arm motions in the browser (Meshcat), or write them as HTML or video."""
     from drake_clutter.catalog import load_catalog
-    from drake_clutter.reports.recording import concatenate_motions
-    from drake_clutter.station.trajectory_file import read_trajectories
+    from drake_clutter.recording.hdf5_file import load_episode
+    from drake_clutter.reports.recording import replay_frames
 
-    scene, cell, moves = read_trajectories(file, load_catalog(catalog))
-    if not moves:
+    episode = load_episode(file, load_catalog(catalog), images=False)
+    for number, action in enumerate(episode.actions, start=1):
+        text = f"{number}. {action.move}: {action.result.value}"
+        if action.failure_reason:
+            text += f" ({action.failure_reason})"
+        if action.samples is not None:
+            text += f", {action.samples.time[-1]:.1f} s"
+        out_console.print(text, highlight=False)
+    if all(action.samples is None for action in episode.actions):
         raise InputError(f"{file}: holds no motion; expected a file with at least one move")
-    for number, (move, motion) in enumerate(moves, start=1):
-        out_console.print(f"{number}. {move}: {motion[-1].time:.1f} s", highlight=False)
-    recording = concatenate_motions([motion for _, motion in moves])
-    show_recording(file, scene, recording, cell, html_file)
+    if mp4_file is not None:
+        from drake_clutter.reports.filmstrip import render_frames
+        from drake_clutter.reports.video import VIDEO_RATE, VIDEO_SIDE, check_video, write_video
+
+        check_video()
+        frames = replay_frames(episode, speed, VIDEO_RATE)
+        images = render_frames(episode.initial_scene, frames, episode.cell, VIDEO_SIDE)
+        write_video(mp4_file, progress_bar("pictures", images, 0, len(frames)))
+        print_line(f"Wrote {mp4_file}.")
+    if html_file is not None or mp4_file is None:
+        frames = replay_frames(episode, speed)
+        show_recording(file, episode.initial_scene, frames, episode.cell, html_file)

@@ -21,6 +21,8 @@ from drake_clutter.planning.plan_export import (
     check_export,
     export_plan,
 )
+from drake_clutter.recording.episode_recorder import make_recorded_episode
+from drake_clutter.recording.hdf5_file import action_name, save_episode
 from drake_clutter.reports.episode_page import write_episode_page
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.interfaces import Move, Observation
@@ -30,7 +32,6 @@ from drake_clutter.scenes.scene_file import save_scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.drake_judge import DrakeJudge
 from drake_clutter.station.arm_executor import ArmExecutor
-from drake_clutter.station.trajectory_file import write_trajectories
 from drake_clutter.tasks.belief import Belief, Decision
 from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration_task import ExplorationTask, TerminationReason, Transition
@@ -39,6 +40,8 @@ from drake_clutter.yaml_io import read_yaml
 
 EPISODE_FILE = "episode.json"
 """File of an episode's document, which is written last."""
+TRAJECTORY_FILE = "trajectory.h5"
+"""File of the motions of the arm."""
 PLAN_FILE = "plan.json"
 """File of planned moves."""
 DEFAULT_EXPORT_RATE = 500.0
@@ -236,9 +239,10 @@ def episode_to_dict(task: ExplorationTask, agent: str, fidelity: str, seed: int)
     """Return the document of `episode.json`."""
     end = task.termination or TerminationReason.GAVE_UP
     moves = []
-    for step in task.transitions:
+    for number, step in enumerate(task.transitions, start=1):
         moves.append(
             {
+                "action": action_name(number) if fidelity == "arm" else None,
                 "move": {"pick": step.move.pick, "place": step.move.place},
                 "outcome": step.outcome.result.value,
                 "instability": step.outcome.instability_text or None,
@@ -256,6 +260,7 @@ def episode_to_dict(task: ExplorationTask, agent: str, fidelity: str, seed: int)
         "fidelity": fidelity,
         "success": end is TerminationReason.ALL_FOUND,
         "termination": end.value,
+        "trajectory": TRAJECTORY_FILE if fidelity == "arm" else None,
         "num_objects": len(task.scene.objects),
         "initially_hidden": list(task.initially_hidden),
         "found": list(task.found),
@@ -300,12 +305,16 @@ def write_episode(
         out, title, task.initial_scene, task.initial_perception, task.transitions, fields, cell
     )
     if fidelity == "arm":
-        write_trajectories(
-            out / "trajectory.h5",
+        episode = make_recorded_episode(
             task.initial_scene,
-            [(step.move, step.outcome) for step in task.transitions],
             cell,
+            task.transitions,
+            policy_name=agent,
+            termination=fields["termination"],
+            seed=seed,
+            scene_name=title,
         )
+        save_episode(out / TRAJECTORY_FILE, episode)
     fields["cell"] = to_plain(cell)
     write_json(out / EPISODE_FILE, fields)
     return fields

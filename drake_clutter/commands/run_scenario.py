@@ -23,6 +23,7 @@ from drake_clutter.files import InputError, file_sha256, reading_file, write_tex
 from drake_clutter.learning.pretrained import checkpoint_sha256
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_file import load_scene, save_scene
+from drake_clutter.station.motion_recorder import DEFAULT_RATE
 from drake_clutter.systems.closed_loop import ClosedLoop, Timing
 from drake_clutter.systems.scenario import (
     PRETRAINED_DETECTORS,
@@ -104,7 +105,7 @@ def run_closed_loop(
         perceive=perceive,
         seed=scenario.seed,
         config=scenario.world,
-        record_motion=True,
+        rate=DEFAULT_RATE,
     )
     task = run_episode(
         closed_loop, policy, max_moves=scenario.max_moves, on_transition=on_transition

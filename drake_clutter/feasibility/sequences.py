@@ -111,7 +111,8 @@ def search_scene(
     outcomes = [transition.outcome for transition in task.transitions]
     robot_time = planned.robot_time
     if simulate:
-        robot_time = sum(outcome.motion[-1].time for outcome in outcomes if outcome.motion)
+        samples = [outcome.samples for outcome in outcomes if outcome.samples is not None]
+        robot_time = sum(float(motion.time[-1]) for motion in samples)
     return SequenceRecord(
         setup=setup,
         scene=name,

@@ -13,6 +13,8 @@ Attributes of the file:
     rate             Samples per second [Hz].
     package_version  Version of drake_clutter.
     drake_version    Version of Drake.
+    error            Exception of the policy that ended the episode; "" for none.
+    variation        What was randomized, as JSON.
     joint_names      Names of the arm's joints.
     tool_names       Names of the gripper's tools.
     object_names     Names of the objects.
@@ -21,13 +23,15 @@ Attributes of the file:
     frames           Meaning of the letters that name frames.
 
 Each attempted move has a group `action_0001`, `action_0002`, ... with the attributes `pick`,
-`place`, `result`, `detail`, `failure_reason`, `instability`, `tool` and `X_TO_place`. If it was
-executed, it has a dataset for each of `CHANNELS`, with the attributes `description`, `unit`,
-`frame` and `columns`, and further attributes `time_step` and `movable`. `X_WG` is a link to `X_TG`,
-because the support's frame is the world of every simulation. Images are in
+`place`, `result`, `detail`, `failure_reason`, `instability`, `tool` and `X_TO_place`, and the
+dataset `believed` with the poses that the policy assumed, if they are known. If it was executed, it
+has a dataset for each of `CHANNELS`, with the attributes `description`, `unit`, `frame` and
+`columns`, and further attributes `time_step` and `movable`. `X_WG` is a link to `X_TG`, because the
+support's frame is the world of every simulation. Images are in
 `images/CAMERA/{time, X_TC, rgb, depth, segmentation}`.
 """
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from enum import Enum
@@ -40,8 +44,16 @@ from numpy.typing import NDArray
 
 from drake_clutter.catalog import Catalog
 from drake_clutter.cell.work_cell import WorkCell, default_cell
-from drake_clutter.files import InputError, atomic_write, format_value, input_error, reading_file
+from drake_clutter.files import (
+    InputError,
+    atomic_write,
+    format_value,
+    input_error,
+    parse_json,
+    reading_file,
+)
 from drake_clutter.limits import MAX_COUNT, MAX_IMAGE_SIDE, MAX_SAMPLES, MAX_SEED
+from drake_clutter.recording.hdf5_version_1 import read_version_1
 from drake_clutter.recording.recorded_episode import (
     CameraImages,
     RecordedAction,
@@ -70,6 +82,8 @@ MAX_RATE = 1000.0
 """Largest number of samples per second [Hz]: more than the plant has steps."""
 MAX_TIME_STEP = 0.1
 """Largest time step of a simulation [s]: objects fall through others within it."""
+MAX_OBJECTS = 10_000
+"""Largest number of objects of a belief: more than any scene has."""
 MAX_CAMERAS = 100
 """Largest number of cameras."""
 MAX_QUATERNION_ERROR = 0.01
@@ -84,8 +98,8 @@ FRAMES = (
     "pose of B in A."
 )
 """Meaning of the letters that name frames."""
-_CONTENT = f"a recorded episode of version {FORMAT_VERSION} (HDF5)"
-_TEXTS = ("policy", "termination", "scene_name", "package_version", "drake_version")
+_CONTENT = f"a recorded episode of version 1 to {FORMAT_VERSION} (HDF5)"
+_TEXTS = ("policy", "termination", "scene_name", "package_version", "drake_version", "error")
 """Attributes of the file with a text, which are also fields of `RecordedEpisode`."""
 _ACTION_TEXTS = ("detail", "failure_reason", "instability", "tool")
 """Attributes of an action with a text, which are also fields of `RecordedAction`."""
@@ -97,6 +111,11 @@ _IMAGE_TYPES = {
     "segmentation": ("uint8", "uint16"),
 }
 """Types of each kind of image."""
+
+
+def action_name(number: int) -> str:
+    """Return the name of an action's group; the first number is 1."""
+    return f"action_{number:04d}"
 
 
 def save_episode(path: Path, episode: RecordedEpisode) -> None:
@@ -118,6 +137,7 @@ def save_episode(path: Path, episode: RecordedEpisode) -> None:
                 "scene": scene_to_yaml(episode.initial_scene, cell),
                 "cell": config_yaml(cell),
                 **{name: getattr(episode, name) for name in _TEXTS},
+                "variation": json.dumps(episode.variation, sort_keys=True, allow_nan=False),
                 "seed": episode.seed,
                 "index": episode.index,
                 "rate": episode.rate,
@@ -130,7 +150,7 @@ def save_episode(path: Path, episode: RecordedEpisode) -> None:
             }
         )
         for number, action in enumerate(episode.actions, start=1):
-            _write_action(file.create_group(f"action_{number:04d}"), action, axes)
+            _write_action(file.create_group(action_name(number)), action, axes)
         file.flush()
         image = file.id.get_file_image()
     with atomic_write(path) as temporary:
@@ -155,6 +175,18 @@ def _write_action(
             ),
         }
     )
+    if action.believed:
+        rows = [[*X_TO.quaternion, *X_TO.translation] for X_TO in action.believed.values()]
+        believed = _write_dataset(group, "believed", np.array(rows))
+        believed.attrs.update(
+            {
+                "description": "poses of the objects that the policy assumed",
+                "unit": "1, m",
+                "frame": "T",
+                "columns": _text_array(POSE_COLUMNS),
+                "names": _text_array(action.believed),
+            }
+        )
     if action.samples is not None:
         group.attrs["time_step"] = action.samples.time_step
         group.attrs["movable"] = _text_array(action.samples.movable)
@@ -217,7 +249,7 @@ def _write_images(group: h5py.Group, images: CameraImages) -> None:
 
 
 def load_episode(path: Path, catalog: Catalog, *, images: bool = True) -> RecordedEpisode:
-    """Read an episode.
+    """Read an episode, also of a trajectory file of version 1.
 
     Args:
         path: File to read.
@@ -229,15 +261,16 @@ def load_episode(path: Path, catalog: Catalog, *, images: bool = True) -> Record
     """
     with reading_file(path, _CONTENT), h5py.File(path) as file:
         reader = _Attributes(str(path), file.attrs)
-        version = reader.integer("version", 0, MAX_COUNT)
-        if version != FORMAT_VERSION:
-            raise input_error(str(path), f"version: {version}; expected {FORMAT_VERSION}")
+        version = reader.integer("version", 1, FORMAT_VERSION)
+        if version == 1:
+            return read_version_1(path, file, catalog)
         scene = scene_from_yaml(reader.text("scene"), f"{path}:scene", catalog).scene
         episode = RecordedEpisode(
             initial_scene=scene,
             cell=_read_cell(path, reader.text("cell")).with_support(scene.support),
             actions=(),
             **{name: reader.text(name) for name in _TEXTS},
+            variation=_read_variation(path, reader.text("variation")),
             seed=reader.integer("seed", -1, MAX_SEED),
             index=reader.integer("index", 0, MAX_COUNT),
             rate=reader.quantity("rate", MAX_RATE),
@@ -245,7 +278,7 @@ def load_episode(path: Path, catalog: Catalog, *, images: bool = True) -> Record
         axes = episode.axes
         if len(file) > MAX_ACTIONS:
             raise input_error(str(path), f"has {len(file)} actions; expected at most {MAX_ACTIONS}")
-        expected = [f"action_{number:04d}" for number in range(1, len(file) + 1)]
+        expected = [action_name(number) for number in range(1, len(file) + 1)]
         if sorted(file) != expected:
             problem = f"groups: {format_value([*file])}"
             raise input_error(str(path), f"{problem}; expected {format_value(expected)}")
@@ -259,6 +292,15 @@ def _read_cell(path: Path, text: str) -> WorkCell:
     """Return the work cell of a file."""
     source = f"{path}:cell"
     return override_config(default_cell(), parse_yaml(text, source), source)
+
+
+def _read_variation(path: Path, text: str) -> Mapping[str, Any]:
+    """Return what was randomized."""
+    variation = parse_json(text, f"{path}:variation", "a JSON object")
+    if not isinstance(variation, dict):
+        problem = f"variation: {format_value(variation)}"
+        raise input_error(str(path), f"{problem}; expected a JSON object")
+    return variation
 
 
 class _Attributes:
@@ -276,6 +318,7 @@ class _Attributes:
 
     def _error(self, name: str, allowed: str) -> InputError:
         value = self._attributes.get(name)
+        value = value.item() if isinstance(value, np.generic) else value
         shown = "is missing" if value is None else format_value(value)
         return input_error(self._source, f"{name}: {shown}; expected {allowed}")
 
@@ -363,9 +406,24 @@ class _ActionReader:
             attributes.choice("result", MoveResult),
             **{name: attributes.text(name) for name in _ACTION_TEXTS},
             X_TO_place=X_TO_place,
+            believed=self._read_believed() if "believed" in self._group else {},
             samples=self._read_samples() if "time" in self._group else None,
             images=self._read_images() if images and "images" in self._group else {},
         )
+
+    def _read_believed(self) -> dict[str, Pose]:
+        """Return the poses of the belief by name."""
+        count = self._count(self._group, "believed", MAX_OBJECTS)
+        shape = (count, len(POSE_COLUMNS))
+        rows = self._array(self._group, "believed", shape, ("float64",))
+        self._check_poses("believed", rows)
+        source = f"{self._source}.believed"
+        names = _Attributes(source, self._group["believed"].attrs).texts("names", count)
+        if len(set(names)) != count:
+            problem = f"names: {format_value([*names])}"
+            raise input_error(source, f"{problem}; expected {count} different names")
+        poses = (Pose(tuple(row[4:]), tuple(row[:4])) for row in rows.tolist())
+        return dict(zip(names, poses, strict=True))
 
     def _read_samples(self) -> ActionSamples:
         """Return the samples."""

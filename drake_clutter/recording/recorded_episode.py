@@ -6,6 +6,7 @@ camera, z along its optical axis, y down.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,9 +55,11 @@ class RecordedAction:
         failure_reason: Value of the `PlanningFailureReason` of a move without a plan; "" with one.
         instability: Object that fell and how; "" for none.
         tool: Name of the tool that the plan uses; "" without a plan.
-        X_TO_place: Pose at which the object was to be released; None without a placement.
+        X_TO_place: Pose at which the object was to be released; None without a plan.
         samples: Samples; None if nothing was executed.
         images: Images by name of the camera.
+        believed: Poses X_TO that the policy assumed when it chose the move, by name of its belief;
+            empty if unknown.
     """
 
     move: Move
@@ -68,6 +71,7 @@ class RecordedAction:
     X_TO_place: Pose | None = None
     samples: ActionSamples | None = field(default=None, repr=False)
     images: Mapping[str, CameraImages] = field(default_factory=dict, repr=False)
+    believed: Mapping[str, Pose] = field(default_factory=dict, repr=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +90,8 @@ class RecordedEpisode:
         rate: Samples per second [Hz].
         package_version: Version of this package.
         drake_version: Version of Drake.
+        error: Message of the exception with which the policy ended the episode; "" for none.
+        variation: What was randomized, as plain values.
     """
 
     initial_scene: Scene = field(repr=False)
@@ -99,6 +105,8 @@ class RecordedEpisode:
     rate: float
     package_version: str
     drake_version: str
+    error: str = ""
+    variation: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     @property
     def axes(self) -> dict[str, tuple[str, ...]]:

@@ -16,7 +16,7 @@ from drake_clutter.files import atomic_write, write_text
 from drake_clutter.perception.label_detector import PerceptionResult
 from drake_clutter.reports.detection_image import draw_detections
 from drake_clutter.reports.filmstrip import render_frames, select_key_frames
-from drake_clutter.reports.recording import episode_frames, write_recording
+from drake_clutter.reports.recording import episode_frames, motion_frames, write_recording
 from drake_clutter.reports.scene_images import Annotations, Highlight, SceneRenderer, display_name
 from drake_clutter.scenes.interfaces import Instability, InstabilityReason, Move, MoveResult
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
@@ -37,6 +37,7 @@ _LEGEND = {
 _DASHED = (Highlight.HIDDEN, Highlight.OCCLUDED)
 _BADGES = {
     MoveResult.PLACED: "good",
+    MoveResult.CAME_OFF: "good",
     MoveResult.COLLAPSED: "bad",
     MoveResult.LEFT_TRAY: "bad",
     MoveResult.DROPPED: "bad",
@@ -147,10 +148,9 @@ class _PageImages:
 
 def _recording_note(steps: Sequence[Transition]) -> str:
     """Return what of the recording is simulated."""
-    motions = [step.outcome.motion for step in steps if step.outcome.motion]
-    if any(motion[0].arm for motion in motions):
+    if any(step.outcome.samples is not None for step in steps):
         return _RECORDING_NOTES["arm"]
-    return _RECORDING_NOTES["settle" if motions else "static"]
+    return _RECORDING_NOTES["settle" if any(step.outcome.motion for step in steps) else "static"]
 
 
 def _initial_scene_html(images: _PageImages, scene: Scene, hidden: Sequence[str]) -> str:
@@ -294,10 +294,10 @@ def _arm_figures(
     images: _PageImages, number: int, scene: Scene, step: Transition, cell: WorkCell
 ) -> str:
     """Return the figures of the arm during a move; none if no arm executed it."""
-    motion = step.outcome.motion
-    if not motion or not motion[0].arm:
+    samples = step.outcome.samples
+    if samples is None:
         return ""
-    frames = select_key_frames(motion, step.move.pick)
+    frames = select_key_frames(motion_frames(samples, scene.names), step.move.pick)
     figures = [
         images.figure(
             f"move_{number:02d}_arm_{index}",

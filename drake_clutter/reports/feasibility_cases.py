@@ -17,7 +17,7 @@ from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.reports.filmstrip import render_filmstrip
 from drake_clutter.reports.scene_images import Annotations, SceneRenderer
-from drake_clutter.scenes.interfaces import ArmState, MotionSample
+from drake_clutter.scenes.interfaces import MotionSample
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.scene_plant import pose_from_transform
 
@@ -107,7 +107,7 @@ def _plan_key_frames(plan: PickPlacePlan, scene: Scene, cell: WorkCell) -> list[
         q = carry.value(time).ravel()
         X_TO = RigidTransform(tool.pose(q)) @ plan.X_OG.inverse()
         poses = {**scene.poses, plan.pick: pose_from_transform(X_TO)}
-        frames.append(MotionSample(time, poses, ArmState(tuple(q.tolist()), (), (), plan.tool)))
+        frames.append(MotionSample(time, poses, tuple(q.tolist())))
     return frames
 
 

@@ -1,6 +1,6 @@
 """Images of the arm during a recorded move."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,13 +73,13 @@ def render_filmstrip(
     scene: Scene, frames: Sequence[MotionSample], cell: WorkCell, side: int
 ) -> NDArray[np.uint8]:
     """Return the images of n frames side by side; see `render_frames`. Shape (side, side n, 3)."""
-    return np.hstack(render_frames(scene, frames, cell, side))
+    return np.hstack([*render_frames(scene, frames, cell, side)])
 
 
 def render_frames(
     scene: Scene, frames: Sequence[MotionSample], cell: WorkCell, side: int
-) -> list[NDArray[np.uint8]]:
-    """Return an image of the cell for each frame.
+) -> Iterator[NDArray[np.uint8]]:
+    """Yield an image of the cell for each frame.
 
     Args:
         scene: The objects.
@@ -87,7 +87,7 @@ def render_frames(
         cell: The work cell; its support is replaced by the scene's.
         side: Side of an image [px].
 
-    Returns:
+    Yields:
         RGB images. Shape (side, side, 3) each.
     """
     cell = cell.with_support(scene.support)
@@ -116,15 +116,12 @@ def render_frames(
         look_at_pose(R @ np.array(_CAMERA_POSITION), R @ np.array(_CAMERA_TARGET))
     )
     query_port = scene_plant.scene_graph.get_query_output_port()
-    images = list[NDArray[np.uint8]]()
     for frame in frames:
         for name, body in scene_plant.bodies.items():
             plant.SetFreeBodyPose(plant_context, body, rigid_transform(frame.poses[name]))
-        assert frame.arm is not None, "the frames must have joint positions"
-        set_joint_angles(plant, plant_context, arm, frame.arm.q)
+        set_joint_angles(plant, plant_context, arm, frame.q)
         query = query_port.Eval(scene_plant.scene_graph.GetMyContextFromRoot(root_context))
         world_frame = query.inspector().world_frame_id()
         color = query.RenderColorImage(camera, world_frame, X_TC).data[:, :, :3]
         image = Image.fromarray(color).resize((side, side), Image.Resampling.LANCZOS)
-        images.append(np.asarray(image))
-    return images
+        yield np.asarray(image)

@@ -21,6 +21,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.files import write_text
+from drake_clutter.recording.recorded_episode import RecordedEpisode
+from drake_clutter.scenes.action_samples import ActionSamples
 from drake_clutter.scenes.interfaces import MotionSample
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.simulation.cell_plant import add_work_cell, set_joint_angles
@@ -93,8 +95,10 @@ def episode_frames(start: Scene, steps: Sequence[Transition]) -> list[MotionSamp
         if not step.outcome.result.was_executed:
             continue
         pick = step.move.pick
-        motion = step.outcome.motion
-        if not (motion and motion[0].arm):
+        motion: Sequence[MotionSample] = step.outcome.motion
+        if step.outcome.samples is not None:
+            motion = motion_frames(step.outcome.samples, start.names)
+        else:
             for X_TO in _illustrate_carry(
                 scene, pick, step.outcome.X_TO_released or step.outcome.scene[pick].X_TO
             ):
@@ -103,13 +107,59 @@ def episode_frames(start: Scene, steps: Sequence[Transition]) -> list[MotionSamp
                 time += 1 / FRAMES_PER_SECOND
         for frame in motion:
             poses |= frame.poses
-            frames.append(MotionSample(time + frame.time, dict(poses), frame.arm))
+            frames.append(MotionSample(time + frame.time, dict(poses), frame.q))
         scene = step.outcome.scene
         poses = dict(scene.poses)
         time = frames[-1].time + _PAUSE_AFTER_MOVE
         frames.append(MotionSample(time, dict(poses)))
     frames.append(MotionSample(frames[-1].time + _PAUSE_AT_ENDS, dict(poses)))
     return frames
+
+
+def motion_frames(
+    samples: ActionSamples, object_names: Sequence[str], rate: float = FRAMES_PER_SECOND
+) -> list[MotionSample]:
+    """Return the frames of a recorded motion, with its first and last sample.
+
+    Args:
+        samples: The samples.
+        object_names: Names of the objects, in the order of `ActionSamples.X_TO`.
+        rate: Frames per second at most.
+    """
+    numbers = np.floor(samples.time * rate + 1e-6)
+    (picked,) = np.nonzero(np.diff(numbers, prepend=-1.0))
+    indices = [*picked[:-1].tolist(), len(samples) - 1]
+    frames = list[MotionSample]()
+    for k in indices:
+        rows = samples.X_TO[k].tolist()
+        poses = {
+            name: Pose(tuple(row[4:]), tuple(row[:4]))
+            for name, row in zip(object_names, rows, strict=True)
+        }
+        frames.append(MotionSample(float(samples.time[k]), poses, tuple(samples.q[k].tolist())))
+    return frames
+
+
+def replay_frames(
+    episode: RecordedEpisode, speed: float = 1.0, rate: float = FRAMES_PER_SECOND
+) -> list[MotionSample]:
+    """Return the frames of all motions of an episode one after the other, with pauses.
+
+    Args:
+        episode: Recorded episode with at least one motion.
+        speed: Factor by which the motions are played faster.
+        rate: Frames per second of the playback at most.
+    """
+    names = episode.initial_scene.names
+    motions = [
+        [
+            replace(frame, time=frame.time / speed)
+            for frame in motion_frames(action.samples, names, rate / speed)
+        ]
+        for action in episode.actions
+        if action.samples is not None
+    ]
+    return concatenate_motions(motions)
 
 
 def concatenate_motions(motions: Sequence[Sequence[MotionSample]]) -> list[MotionSample]:
@@ -172,7 +222,7 @@ def write_recording(
 
 def _animate(scene: Scene, frames: Sequence[MotionSample], cell: WorkCell) -> Meshcat:
     """Return a viewer with the animation of frames; see `write_recording`."""
-    arm_positions = [frame.arm.q for frame in frames if frame.arm]
+    arm_positions = [frame.q for frame in frames if frame.q]
     # Drake logs the address of the viewer, which callers print where it is of use.
     with suppress_drake_log(logging.WARNING):
         meshcat, paths, arm_poses = _build_viewer(scene, cell, arm=bool(arm_positions))
@@ -185,9 +235,7 @@ def _animate(scene: Scene, frames: Sequence[MotionSample], cell: WorkCell) -> Me
         all_poses = list[dict[str, Pose]]()
         q = arm_positions[0] if arm_positions else ()
         for frame in frames:
-            q = (
-                frame.arm.q if frame.arm else q
-            )  # without joint positions the arm stays where it was
+            q = frame.q or q  # without joint positions the arm stays where it was
             all_poses.append({**scene.poses, **frame.poses, **arm_poses(q)})
         for name, meshcat_path in paths.items():
             for index, pose in _key_frames([poses[name] for poses in all_poses]):

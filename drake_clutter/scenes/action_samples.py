@@ -63,7 +63,7 @@ CHANNELS = (
     Channel("X_TG", "pose of the tool that the action uses", "1, m", ("pose",), "T"),
     Channel("held_object", "index of the held object, -1 for none", "", dtype="int16"),
     Channel("phase", "index of the plan's step, -1 for one of another name", "", dtype="int16"),
-    Channel("tool_contact", "whether the gripper touches an object", "", dtype="bool"),
+    Channel("tool_contact", "whether the gripper touches or holds an object", "", dtype="bool"),
     Channel(
         "object_contact",
         "whether the held object touches anything but the gripper",
@@ -96,7 +96,7 @@ class ActionSamples:
         X_TG: Pose of the tool that the action uses, as `POSE_COLUMNS`. Shape (m, 7).
         held_object: Index of the object that is held; -1 for none. Shape (m,).
         phase: Index of the plan's step in `PHASES`; -1 for one of another name. Shape (m,).
-        tool_contact: Whether the gripper touches an object. Shape (m,).
+        tool_contact: Whether the gripper touches or holds an object. Shape (m,).
         object_contact: Whether the held object touches anything but the gripper. Shape (m,).
         X_TO: Pose of each object, as `POSE_COLUMNS`. Shape (m, o, 7).
         time_step: Time step of the simulation [s]; NaN if unknown.

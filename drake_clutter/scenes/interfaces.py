@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Protocol
 
@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.support import Support
+from drake_clutter.scenes.action_samples import ActionSamples
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
 
 
@@ -201,6 +202,8 @@ class MoveResult(Enum):
 
     Attributes:
         PLACED: The object is at its placement, and the scene is stable.
+        CAME_OFF: The gripper lost the object, which is at its placement all the same, and the scene
+            is stable.
         COLLAPSED: The scene is unstable after the move.
         LEFT_TRAY: An object fell off the support.
         NO_FREE_PLACEMENT: No placement is known to be free.
@@ -210,6 +213,7 @@ class MoveResult(Enum):
     """
 
     PLACED = "placed"
+    CAME_OFF = "came off"
     COLLAPSED = "collapsed"
     LEFT_TRAY = "left the tray"
     NO_FREE_PLACEMENT = "no free spot"
@@ -220,7 +224,12 @@ class MoveResult(Enum):
     @property
     def was_executed(self) -> bool:
         """Whether anything was moved."""
-        return self in (MoveResult.PLACED, MoveResult.DROPPED) or self.ends_episode
+        return self.is_at_placement or self is MoveResult.DROPPED or self.ends_episode
+
+    @property
+    def is_at_placement(self) -> bool:
+        """Whether the object is where it was to be, in a stable scene."""
+        return self in (MoveResult.PLACED, MoveResult.CAME_OFF)
 
     @property
     def ends_episode(self) -> bool:
@@ -235,35 +244,18 @@ class MoveResult(Enum):
 
 
 @dataclass(frozen=True)
-class ArmState:
-    """State of an arm at one time.
-
-    Attributes:
-        q: Joint positions [rad]. Shape (n,).
-        v: Joint velocities [rad/s]. Shape (n,).
-        torque: Torques of the motors [N m]. Shape (n,).
-        tool: Name of the tool that is commanded to hold an object; "" for none.
-    """
-
-    q: tuple[float, ...]
-    v: tuple[float, ...]
-    torque: tuple[float, ...]
-    tool: str
-
-
-@dataclass(frozen=True)
 class MotionSample:
-    """Poses of the objects at one time of a motion.
+    """What a picture shows of one time of a motion.
 
     Attributes:
-        time: Time since the move began [s].
+        time: Time since the motion began [s].
         poses: X_TO of the objects, by name.
-        arm: State of the arm that moves them, or None.
+        q: Joint positions of the arm that moves them [rad]; empty without an arm. Shape (n,).
     """
 
     time: float
     poses: Mapping[str, Pose]
-    arm: ArmState | None = None
+    q: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -274,11 +266,12 @@ class Outcome:
         result: How the move ended.
         scene: The scene after the move; the scene before it if nothing was moved.
         instability: The failed object of a collapsed scene, or the object that left the support.
-        motion: Recorded motion of the whole move, or without an arm, of the scene after the
-            release.
+        motion: Motion of the scene after the release, without an arm.
         inconclusive: What the executor's model does not cover, if that is the result.
         detail: Reason why no plan was found, or a remark on the execution.
         X_TO_released: Pose at which the picked object was released.
+        samples: Recorded motion of arm and scene; None without an arm.
+        failure_reason: Value of the `PlanningFailureReason` if no plan was found; else "".
     """
 
     result: MoveResult
@@ -288,6 +281,8 @@ class Outcome:
     inconclusive: InconclusiveVerdict | None = None
     detail: str = ""
     X_TO_released: Pose | None = None
+    samples: ActionSamples | None = field(repr=False, default=None)
+    failure_reason: str = ""
 
     @property
     def instability_text(self) -> str:

@@ -21,6 +21,7 @@ from drake_clutter.scenes.interfaces import (
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.simulation.drake_judge import TOUCHING_MARGIN
 from drake_clutter.simulation.settle import find_instability, settle
+from drake_clutter.station.motion_recorder import DEFAULT_RATE
 from drake_clutter.station.station_simulation import simulate_plan
 
 MIN_DISPLACEMENT = 1e-4
@@ -41,15 +42,21 @@ class ArmExecutor:
     """
 
     def __init__(
-        self, config: ClutterConfig, *, planner_config: PlannerConfig | None = None
+        self,
+        config: ClutterConfig,
+        *,
+        planner_config: PlannerConfig | None = None,
+        rate: float = DEFAULT_RATE,
     ) -> None:
         """Create an executor.
 
         Args:
             config: Work cell and settle limits.
             planner_config: Parameters of the planner; None for the defaults.
+            rate: Recorded samples per second [Hz].
         """
         self._config = config
+        self._rate = rate
         self._planner_config = planner_config or PlannerConfig()
         self._planner: PickPlacePlanner | None = None
 
@@ -70,15 +77,20 @@ class ArmExecutor:
         """Plan and simulate a command, see `MoveExecutor.execute`."""
         plan = self.plan(scene, command)
         if isinstance(plan, PlanningFailure):
-            return Outcome(MoveResult.NOT_PLANNED, scene, detail=str(plan))
-        result = simulate_plan(self._config.cell, scene, plan, record=True)
+            return Outcome(
+                MoveResult.NOT_PLANNED,
+                scene,
+                detail=str(plan),
+                failure_reason=plan.reason.value,
+            )
+        result = simulate_plan(self._config.cell, scene, plan, rate=self._rate)
         # The arm lowers the object beyond its planned pose until contact.
         X_TO_place = plan.X_TO_place.translated((0.0, 0.0, -result.lowered_distance))
         after = scene.with_poses(result.poses)
         outcome = evaluate_outcome(
             scene, after, command.move.pick, X_TO_place, result.lost_object, self._config.settle
         )
-        return replace(outcome, motion=result.motion, detail=str(result))
+        return replace(outcome, samples=result.samples, detail=str(result))
 
 
 def evaluate_outcome(
@@ -100,7 +112,7 @@ def evaluate_outcome(
         config: Limits of displacement and tilt.
     """
     expected = before.with_poses({pick: X_TO_place})
-    # An object that detaches at touchdown and stays at its place pose counts as placed.
+    # An object that detaches at touchdown and stays at its place pose came off, but is not dropped.
     dropped = lost_object and worst_instability([expected[pick]], after, config) is not None
     support = before.support
     # Only the move at which an object leaves the support is blamed for it.
@@ -122,7 +134,9 @@ def evaluate_outcome(
             if not disturbed.isdisjoint(o.name for o in group):
                 after = after.with_poses(settle(group, support, config).poses)
         instability = worst_instability(checked, after, config)
-    result = MoveResult.DROPPED if dropped else MoveResult.PLACED
+    result = MoveResult.PLACED
+    if lost_object:
+        result = MoveResult.DROPPED if dropped else MoveResult.CAME_OFF
     if instability is not None:
         result = MoveResult.of_instability(instability)
     return Outcome(result, after, instability, X_TO_released=X_TO_place)

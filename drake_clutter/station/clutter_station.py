@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import RigidBody
+from pydrake.multibody.tree import BodyIndex, RigidBody
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
@@ -15,7 +15,6 @@ from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.suction import SuctionGripper
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.scenes.interfaces import ArmState
 from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.simulation.cell_plant import (
     Arm,
@@ -146,6 +145,12 @@ class ClutterStation(Diagram):
             int(body.index()): name
             for name, body in (self.scene_plant.bodies | self.fixed_bodies).items()
         }
+        self._gripper_bodies = frozenset(int(i) for i in plant.GetBodyIndices(self.arm.gripper))
+        self._body_of_geometry = {
+            int(geometry.get_value()): index
+            for index in range(plant.num_bodies())
+            for geometry in plant.GetCollisionGeometriesForBody(plant.get_body(BodyIndex(index)))
+        }
         self._q_indices, self._v_indices = joint_state_indices(plant, self.arm)
         num_joints = len(self.arm.joints)
         command = builder.AddSystem(Demultiplexer(np.array([2 * num_joints, num_joints])))
@@ -238,17 +243,10 @@ class ClutterStation(Diagram):
         """
         return np.asarray(self.plant.GetPositions(context)[self._q_indices])
 
-    def arm_state(self, context: Context, tool: str) -> ArmState:
-        """Return joint positions, velocities and torques of the arm.
-
-        Args:
-            context: Context of the plant.
-            tool: Name of the tool that is commanded to hold; "" for none.
-        """
-        torque = self.plant.get_net_actuation_output_port(self.arm.robot).Eval(context)
-        q = self.joint_positions(context)
-        v = self.plant.GetVelocities(context)[self._v_indices]
-        return ArmState(tuple(q.tolist()), tuple(v.tolist()), tuple(torque.tolist()), tool)
+    @property
+    def joint_indices(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Indices of the arm's joints in the positions and velocities of the plant. Shape (n,)."""
+        return self._q_indices, self._v_indices
 
     def tool_pose_in_object(self, context: Context, tool: str, name: str) -> RigidTransform:
         """Return X_OG of a tool and an object, by their names, in a context of the plant."""
@@ -293,19 +291,37 @@ class ClutterStation(Diagram):
         Args:
             context: Context of the plant.
         """
+        bodies = {body for pair in self._contacts(context) for body in pair}
+        return {self._object_names[body] for body in bodies if body in self._object_names}
+
+    def contact_flags(self, context: Context, held: str) -> tuple[bool, bool]:
+        """Return whether the gripper touches or holds an object, and the held one anything else.
+
+        Args:
+            context: Context of the plant.
+            held: Name of the object that the gripper holds; "" for none.
+        """
+        touches_tool = held != ""
+        touches_held = False
+        for pair in self._contacts(context):
+            is_gripper = not self._gripper_bodies.isdisjoint(pair)
+            names = [self._object_names.get(body, "") for body in pair]
+            touches_tool |= is_gripper and any(names)
+            touches_held |= not is_gripper and held != "" and held in names
+        return touches_tool, touches_held
+
+    def _contacts(self, context: Context) -> list[tuple[int, int]]:
+        """Return the indices of each pair of bodies in contact."""
         results = self.plant.get_contact_results_output_port().Eval(context)
-        inspector = self.scene_plant.scene_graph.model_inspector()
-        bodies = list[int]()
+        pairs = list[tuple[int, int]]()
         for i in range(results.num_hydroelastic_contacts()):
             surface = results.hydroelastic_contact_info(i).contact_surface()
-            for geometry in (surface.id_M(), surface.id_N()):
-                body = self.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry))
-                if body is not None:
-                    bodies.append(int(body.index()))
+            first, second = surface.id_M().get_value(), surface.id_N().get_value()
+            pairs.append((self._body_of_geometry[first], self._body_of_geometry[second]))
         for i in range(results.num_point_pair_contacts()):
-            pair = results.point_pair_contact_info(i)
-            bodies += [int(pair.bodyA_index()), int(pair.bodyB_index())]
-        return {self._object_names[body] for body in bodies if body in self._object_names}
+            info = results.point_pair_contact_info(i)
+            pairs.append((int(info.bodyA_index()), int(info.bodyB_index())))
+        return pairs
 
 
 def _make_grasp_constraint(

@@ -1,6 +1,7 @@
 """Command schedule of a plan: joint commands and grasp times."""
 
 import math
+from bisect import bisect_right
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,13 +76,35 @@ class CommandSchedule:
 
     def tool_at(self, time: float) -> str:
         """Return the name of the tool that is commanded to hold at a time [s]; "" for none."""
-        return self.steps[int(np.searchsorted(self.starts, time, side="right")) - 1].tool
+        return self.steps[bisect_right(self.starts, time) - 1].tool
 
     def stage_at(self, time: float) -> str:
         """Return the name of the step at a time [s], see `PlanStep`; `idle` after the end."""
         if time >= self.end_time:
             return "idle"
-        return self.steps[int(np.searchsorted(self.starts, time + 1e-9, side="right")) - 1].name
+        return self.steps[bisect_right(self.starts, time + 1e-9) - 1].name
+
+
+@dataclass(frozen=True)
+class RecordedSchedule(CommandSchedule):
+    """Recorded commands, which the executor repeats without waiting or looking for contact.
+
+    Attributes:
+        gripper_times: Times of the gripper's commands [s]. Shape (k,).
+        gripper_commands: Commanded positions of the gripper's actuated joints [m]. Shape (k, m).
+    """
+
+    gripper_times: Floats
+    gripper_commands: Floats
+
+    def gripper_joints(self, time: float) -> Floats:
+        """Return the commanded positions of the gripper's actuated joints at a time [s].
+
+        Returns:
+            Positions [m]. Shape (m,).
+        """
+        columns = self.gripper_commands.T
+        return np.array([np.interp(time, self.gripper_times, column) for column in columns])
 
 
 def build_command_schedule(

@@ -14,6 +14,7 @@ from drake_clutter.planning.motion_plan import Plan
 from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
 from drake_clutter.scenes.interfaces import Move, Observation, PickPlaceCommand
 from drake_clutter.scenes.scene import SceneObject
+from drake_clutter.station.command_schedule import CommandSchedule
 
 
 @dataclass(frozen=True)
@@ -67,9 +68,11 @@ class PlannedMove(Message):
     Attributes:
         number: Number of the request.
         plan: Plan; None if `number` is 0.
+        schedule: Commands; None for those that follow from the plan.
     """
 
     plan: Plan | None = field(default=None, repr=False)
+    schedule: CommandSchedule | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)

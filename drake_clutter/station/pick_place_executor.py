@@ -22,7 +22,11 @@ from drake_clutter.planning.arm_dynamics import arm_dynamics
 from drake_clutter.planning.motion_plan import Plan
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.robots.robot_model import load_robot
-from drake_clutter.station.command_schedule import CommandSchedule, build_command_schedule
+from drake_clutter.station.command_schedule import (
+    CommandSchedule,
+    RecordedSchedule,
+    build_command_schedule,
+)
 from drake_clutter.station.messages import ExecutorStatus, Message, PlannedMove
 
 Floats = NDArray[np.float64]
@@ -188,7 +192,7 @@ class PickPlaceExecutor(LeafSystem):
         move: PlannedMove = self._plan.Eval(context) if has_input else PlannedMove()
         is_new = move.plan is not None and move.number != current.number
         if move.plan is not None and is_new and current.has_ended(time):
-            schedule = build_command_schedule(move.plan, self._cell)
+            schedule = move.schedule or build_command_schedule(move.plan, self._cell)
             updated = ExecutorState(move.number, move.plan, schedule, time)
         if updated is not current:
             state.get_mutable_abstract_state(int(self._state)).set_value(updated)
@@ -200,6 +204,7 @@ class PickPlaceExecutor(LeafSystem):
         if (
             not isinstance(gripper, SuctionGripper)
             or schedule is None
+            or isinstance(schedule, RecordedSchedule)
             or not self._vacuum.HasValue(context)
             or state.waited + EXECUTOR_UPDATE_PERIOD > gripper.grip_timeout
         ):

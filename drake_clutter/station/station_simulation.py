@@ -21,10 +21,11 @@ from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.files import InputError, format_value
 from drake_clutter.planning.motion_plan import Plan
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
-from drake_clutter.scenes.interfaces import MotionSample
+from drake_clutter.scenes.action_samples import ActionSamples
 from drake_clutter.scenes.scene import Pose, Scene, tilt_between
 from drake_clutter.station.body_sleep import BodySleepManager, affected_bodies, bodies_to_wake
 from drake_clutter.station.clutter_station import ClutterStation
+from drake_clutter.station.command_schedule import CommandSchedule
 from drake_clutter.station.grasp_constraint import WeldPair
 from drake_clutter.station.gripper_actuator import (
     GRIPPER_UPDATE_PERIOD,
@@ -33,12 +34,13 @@ from drake_clutter.station.gripper_actuator import (
 )
 from drake_clutter.station.jaw_actuator import JawActuator
 from drake_clutter.station.messages import PlannedMove
+from drake_clutter.station.motion_recorder import MotionRecorder
 from drake_clutter.station.pick_place_executor import ExecutorState, PickPlaceExecutor
 
 SETTLE_TIME = 0.1
 """Time simulated after the arm is home [s]."""
 STEP_PERIOD = 0.025
-"""Period of a step: of updates of `BodySleepManager`, and of recorded samples [s]."""
+"""Period of a step: of updates of `BodySleepManager` [s]."""
 TIME_STEP = STEP_PERIOD / 10
 """Time step of the plant [s]. With twice as much, high stacks creep and fall."""
 COARSE_TIME_STEP = 2 * TIME_STEP
@@ -83,7 +85,7 @@ class PickPlaceResult:
         lowered_distance: Distance between planned and actual release height [m].
         max_tracking_error: Largest tracking error of a joint [rad].
         simulated_time: Simulation time at the end [s].
-        motion: Recorded samples; empty if not recorded.
+        samples: Recorded samples; None if not recorded.
     """
 
     poses: dict[str, Pose]
@@ -97,7 +99,7 @@ class PickPlaceResult:
     lowered_distance: float
     max_tracking_error: float
     simulated_time: float
-    motion: tuple[MotionSample, ...] = field(repr=False, default=())
+    samples: ActionSamples | None = field(repr=False, default=None)
 
     @property
     def lost_object(self) -> bool:
@@ -136,6 +138,7 @@ class StationSimulation:
         diagram: Root diagram with station, executor and added systems.
         simulator: Simulator of the diagram.
         gripper: Attaches and releases objects.
+        recorder: Records motions; None without a rate.
     """
 
     def __init__(
@@ -148,6 +151,7 @@ class StationSimulation:
         weld: WeldPair | None = None,
         visuals: bool = False,
         add_systems: AddSystems | None = None,
+        rate: float | None = None,
     ) -> None:
         """Build the diagram and reset it to a scene.
 
@@ -161,6 +165,7 @@ class StationSimulation:
             visuals: Whether to add visual geometry for cameras.
             add_systems: Adds further systems, such as a planner; None if plans are passed to
                 `execute`.
+            rate: Samples of motions per second [Hz]; None records nothing.
 
         Raises:
             InputError: A model of the cell cannot be used.
@@ -201,6 +206,7 @@ class StationSimulation:
             self.station, self.cell.gripper, self._commanded_tool
         )
         self._sleep = BodySleepManager(self.station)
+        self._rate = rate
         self.reset(scene)
 
     def reset(self, scene: Scene) -> None:
@@ -220,6 +226,12 @@ class StationSimulation:
         self._num_steps = 0
         self._affected_plan = 0
         self._affected: tuple[frozenset[str], ...] = ()
+        self.recorder: MotionRecorder | None = None
+        if self._rate is not None:
+            self.recorder = MotionRecorder(
+                self.station, self.executor, self.gripper, self.root, scene, self._rate
+            )
+            self.simulator.set_monitor(self.recorder.observe)
 
     def release(self) -> None:
         """Free the memory of the diagram; the simulation cannot be used afterwards.
@@ -227,6 +239,8 @@ class StationSimulation:
         Systems written in Python and the diagram that owns them refer to each other through C++,
         which the garbage collector does not see.
         """
+        self.simulator.clear_monitor()
+        self.recorder = None
         for system in (self.station.vacuum_system, self.station, self.executor):
             if system is not None:
                 system.__dict__.clear()
@@ -270,6 +284,15 @@ class StationSimulation:
         """Whether a plan is executed."""
         return not self.executor_state.has_ended(self.root.get_time())
 
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether no plan is executed, and none was within `SETTLE_TIME`."""
+        state = self.executor_state
+        if state.schedule is None:
+            return True
+        end = state.start_time + state.waited + state.schedule.end_time
+        return self._num_steps * STEP_PERIOD >= end + SETTLE_TIME
+
     def step(self) -> None:
         """Advance by `STEP_PERIOD`."""
         state = self.executor_state
@@ -295,25 +318,18 @@ class StationSimulation:
         while not condition():
             self.step()
 
-    def sample(self) -> MotionSample:
-        """Return the state of arm and objects, with the time since the last plan's start."""
-        context = self.plant_context
-        arm = self.station.arm_state(context, self._commanded_tool(self.root))
-        time = self.root.get_time() - self.executor_state.start_time
-        return MotionSample(time, self._poses(), arm)
-
     def _poses(self) -> dict[str, Pose]:
         """Return X_TO of all objects, by name."""
         return {o.name: o.X_TO for o in self.scene.objects}
 
-    def execute(self, plan: Plan, *, record: bool = False) -> PickPlaceResult:
+    def execute(self, plan: Plan, schedule: CommandSchedule | None = None) -> PickPlaceResult:
         """Execute a plan until its end, and for `SETTLE_TIME` more.
 
         The diagram must not have been built with `add_systems` that connect the executor.
 
         Args:
             plan: Plan to execute.
-            record: Whether to record a sample per step.
+            schedule: Commands; None for those that follow from the plan.
 
         Raises:
             InputError: The plan does not start at the commanded joint positions, or a step names
@@ -323,24 +339,14 @@ class StationSimulation:
         before = self.scene
         number = self.executor_state.number + 1
         context = self.executor.GetMyMutableContextFromRoot(self.root)
-        self.executor.GetInputPort("plan").FixValue(context, PlannedMove(number, plan))
-        motion = list[MotionSample]()
+        self.executor.GetInputPort("plan").FixValue(context, PlannedMove(number, plan, schedule))
         max_tracking_error = 0.0
-
-        def has_settled() -> bool:
-            if self.finished_plan != number:
-                return False
-            state = self.executor_state
-            assert state.schedule is not None
-            end = state.start_time + state.waited + state.schedule.end_time
-            return self._num_steps * STEP_PERIOD >= end + SETTLE_TIME
-
-        while not has_settled():
+        if self.recorder is not None:
+            self.recorder.clear()
+        while self.finished_plan != number or not self.is_at_rest:
             self.step()
             max_tracking_error = max(max_tracking_error, self._tracking_error())
-            if record:
-                motion.append(self.sample())
-        return self._result(plan, before, max_tracking_error, tuple(motion))
+        return self._result(plan, before, max_tracking_error)
 
     def _check_start(self, plan: Plan) -> None:
         """Raise an error unless a plan starts at the commanded joints and names known tools."""
@@ -364,7 +370,6 @@ class StationSimulation:
         plan: Plan,
         before: Scene,
         max_tracking_error: float,
-        motion: tuple[MotionSample, ...],
     ) -> PickPlaceResult:
         poses = self._poses()
         status = self.gripper.status
@@ -392,7 +397,7 @@ class StationSimulation:
             lowered_distance=self.executor_state.lowered_distance,
             max_tracking_error=max_tracking_error,
             simulated_time=self.root.get_time(),
-            motion=motion,
+            samples=None if self.recorder is None else self.recorder.samples(),
         )
 
     def _tracking_error(self) -> float:
@@ -420,7 +425,7 @@ class StationSimulation:
 
 
 def simulate_plan(
-    cell: WorkCell, scene: Scene, plan: PickPlacePlan, *, record: bool = False
+    cell: WorkCell, scene: Scene, plan: PickPlacePlan, *, rate: float | None = None
 ) -> PickPlaceResult:
     """Execute a plan in a simulation of its own.
 
@@ -432,16 +437,16 @@ def simulate_plan(
         cell: Work cell; its support is replaced by that of the scene.
         scene: Objects at rest.
         plan: Plan to execute.
-        record: Whether to record a sample per step.
+        rate: Samples per second [Hz]; None records nothing.
     """
     affected = frozenset[str]().union(*affected_bodies(scene.objects, plan))
-    coarse = StationSimulation(cell, scene, movable=affected, time_step=COARSE_TIME_STEP)
-    result = coarse.execute(plan, record=record)
+    coarse = StationSimulation(cell, scene, movable=affected, time_step=COARSE_TIME_STEP, rate=rate)
+    result = coarse.execute(plan)
     is_accepted = result.is_uneventful and not coarse.woken_fixed_objects
     coarse.release()
     if is_accepted:
         return result
-    fine = StationSimulation(cell, scene)
-    result = fine.execute(plan, record=record)
+    fine = StationSimulation(cell, scene, rate=rate)
+    result = fine.execute(plan)
     fine.release()
     return result

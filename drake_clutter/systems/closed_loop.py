@@ -21,8 +21,9 @@ from drake_clutter.planning.pick_place_plan import (
 )
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.scenes.action_samples import ActionSamples
 from drake_clutter.scenes.geometry import transport_pose
-from drake_clutter.scenes.interfaces import MotionSample, MoveResult, Outcome
+from drake_clutter.scenes.interfaces import MoveResult, Outcome
 from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.station.arm_executor import evaluate_outcome
 from drake_clutter.station.body_sleep import nearest_object
@@ -98,7 +99,7 @@ class ClosedLoop:
         seed: int,
         config: ClutterConfig,
         planner_config: PlannerConfig | None = None,
-        record_motion: bool = False,
+        rate: float | None = None,
     ) -> None:
         """Build the diagram around a scene at rest.
 
@@ -108,10 +109,9 @@ class ClosedLoop:
             seed: Seed of all random numbers.
             config: Config of the cell, the simulation and the task.
             planner_config: Parameters of the planner; None: `default_planner_config`.
-            record_motion: Whether outcomes include the motion of the arm and the objects.
+            rate: Recorded samples of motions per second [Hz]; None records nothing.
         """
         self.scene = scene
-        self._record_motion = record_motion
         self._perceive = perceive
         config = replace(config, cell=config.cell.with_support(scene.support))
         self._config = config if perceive is None else with_image_tolerances(config)
@@ -133,7 +133,7 @@ class ClosedLoop:
             latency=OBSERVATION_TO_PLAN_LATENCY,
         )
         self.simulation = StationSimulation(
-            config.cell, scene, visuals=True, add_systems=self._add_systems
+            config.cell, scene, visuals=True, add_systems=self._add_systems, rate=rate
         )
         self.simulation.diagram.set_name("closed_loop")
         self._planning_time = 0.0
@@ -195,26 +195,33 @@ class ClosedLoop:
         """Run a policy, and yield each attempt after the following observation."""
         self.policy_system.policy = policy
         self._start_time = time.perf_counter()
-        motion = list[MotionSample]()
+        samples: ActionSamples | None = None
         state = self._state
         while state.phase is not PolicyPhase.DONE:
-            is_moving = self.simulation.is_executing
             self.simulation.step()
-            if self._record_motion and is_moving:
-                motion.append(self.simulation.sample())
+            samples = self._take_samples() or samples
             previous, state = state, self._state
             is_done = state.phase is PolicyPhase.DONE
             has_observed = is_done or state.request.number != previous.request.number
             if has_observed and previous.request.number:
-                yield self._attempt(previous, tuple(motion))
-                motion.clear()
+                yield self._attempt(previous, samples)
+                samples = None
 
-    def _attempt(self, state: PolicyState, motion: tuple[MotionSample, ...]) -> MoveAttempt:
+    def _take_samples(self) -> ActionSamples | None:
+        """Return the samples of a motion that has ended; None if none has, or without a rate."""
+        recorder = self.simulation.recorder
+        if recorder is None or not self.simulation.is_at_rest:
+            return None
+        samples = None if recorder.start_time is None else recorder.samples()
+        recorder.clear()
+        return samples
+
+    def _attempt(self, state: PolicyState, samples: ActionSamples | None) -> MoveAttempt:
         """Return the attempt that ended before the policy's latest observation.
 
         Args:
             state: State of the policy before that observation.
-            motion: Motion of the attempt.
+            samples: Recorded motion of the attempt; None if there was none.
         """
         before = self.scene
         decision = state.decision
@@ -231,6 +238,7 @@ class ClosedLoop:
             is_full = plan.reason is PlanningFailureReason.NO_FREE_PLACEMENT
             result = MoveResult.NO_FREE_PLACEMENT if is_full else MoveResult.NOT_PLANNED
             outcome = Outcome(result, before, detail="" if is_full else str(plan))
+            outcome = replace(outcome, failure_reason=plan.reason.value)
             return MoveAttempt(decision, outcome, self.perception)
         picked, outcome = self._outcome(plan)
         assert decision.move is not None
@@ -239,7 +247,7 @@ class ClosedLoop:
         self.scene = self.simulation.scene
         self.perception = self._detector.perceive(self.scene)
         return MoveAttempt(
-            decision, replace(outcome, scene=self.scene, motion=motion), self.perception
+            decision, replace(outcome, scene=self.scene, samples=samples), self.perception
         )
 
     def _outcome(self, plan: PickPlacePlan) -> tuple[str, Outcome]:

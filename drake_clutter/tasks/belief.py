@@ -101,7 +101,7 @@ class Belief:
         history = (*self.history, move)
         if not result.was_executed:
             return replace(self, history=history, invalid_moves=(*self.invalid_moves, move))
-        if result is not MoveResult.PLACED or X_TO_place is None:
+        if not result.is_at_placement or X_TO_place is None:
             return replace(self, history=history, invalid_moves=())
         previous_pose = next(o.X_TO for o in self.objects if o.name == move.pick)
         objects = tuple(

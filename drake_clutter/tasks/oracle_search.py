@@ -368,6 +368,6 @@ class OracleSearch:
             return None
         outcome = self._executor.execute(state.scene, command, rng)
         self._has_inconclusive_verdict |= outcome.result is MoveResult.INCONCLUSIVE
-        if outcome.result is not MoveResult.PLACED:
+        if not outcome.result.is_at_placement:
             return None
         return self._make_state(outcome.scene, state.known, rng.bit_generator.state)
