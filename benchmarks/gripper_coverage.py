@@ -4,7 +4,8 @@
     python benchmarks/gripper_coverage.py moves --count 1000 --seed 41 --workers 2 --out moves.json
 
 `scenes` computes an upper bound on the scenes of a frozen dataset in which the arm can find every
-hidden object. `moves` plans random legal moves, without simulation, for every cell.
+hidden object. `moves` plans random legal moves, without simulation, for every cell. An interrupted
+run is resumed by the same command.
 """
 
 import math
@@ -32,6 +33,7 @@ from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.records import partial_records
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
@@ -39,8 +41,8 @@ from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.arm_reachability_bound import ArmReachabilityBound
 from drake_clutter.tasks.belief import legal_moves
 from drake_clutter.validation import to_plain
-from drake_clutter.workers.parallel_map import map_ordered
-from training.script import SCENES, SeedOption, WorkersOption, progress, run_script
+from training.results_file import collect_records
+from training.script import SCENES, SeedOption, WorkersOption, run_script
 
 CELLS = {
     "one cup": resource_path("models/cells/ur10_single_cup_tray.yaml"),
@@ -53,6 +55,17 @@ PLANNED = "planned"
 """Result of a move for which there is a plan."""
 MOVE_SEED_OFFSET = 1
 """Second key of the random generator of the moves; the first is the seed of the scene."""
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """Record of a scene of a dataset.
+
+    Attributes:
+        unrevealable: Names of the objects that the arm of each cell cannot reveal.
+    """
+
+    unrevealable: dict[str, tuple[str, ...]]
 
 
 class SceneTester:
@@ -70,14 +83,16 @@ class SceneTester:
             for name, path in CELLS.items()
         }
 
-    def __call__(self, index: int) -> dict[str, list[str]]:
-        """Return the names of the objects that the arm of each cell cannot reveal.
+    def __call__(self, index: int) -> SceneRecord:
+        """Return the record of a scene.
 
         Args:
             index: Index of the scene in the dataset.
         """
         scene = self._dataset.settled_scene(index, self._dataset.grammar, CONFIG)
-        return {name: [*bound.find_unrevealable(scene)] for name, bound in self._bounds.items()}
+        return SceneRecord(
+            {name: bound.find_unrevealable(scene) for name, bound in self._bounds.items()}
+        )
 
 
 @dataclass(frozen=True)
@@ -99,6 +114,17 @@ class PlannedTrial:
     tool: str = ""
 
 
+@dataclass(frozen=True)
+class SceneTrials:
+    """Record of a scene.
+
+    Attributes:
+        trials: Its moves, each with every cell.
+    """
+
+    trials: tuple[PlannedTrial, ...]
+
+
 class MovePlanner:
     """Plans random legal moves in a scene for every cell; a worker for `map_ordered`."""
 
@@ -117,7 +143,7 @@ class MovePlanner:
             for name, path in CELLS.items()
         }
 
-    def __call__(self, number: int) -> list[PlannedTrial]:
+    def __call__(self, number: int) -> SceneTrials:
         """Return the trials in the scene of a number."""
         scene = self._scenes(number)
         rng = item_rng(self._seed, number, MOVE_SEED_OFFSET)
@@ -137,7 +163,7 @@ class MovePlanner:
                     trials.append(PlannedTrial(cell, name, PLANNED, tool=plan.tool))
                 else:
                     trials.append(PlannedTrial(cell, name, plan.reason.value, plan.detail))
-        return trials
+        return SceneTrials(tuple(trials))
 
 
 def scenes(
@@ -152,32 +178,36 @@ def scenes(
     path = SCENES / f"{dataset}.json"
     count = len(load_scene_dataset(path, load_catalog()).scenes)
     indices = range(min(count, limit or count))
-    found = [
-        *progress(
-            map_ordered(partial(SceneTester, path), indices, workers=workers),
-            "scenes",
-            len(indices),
+    header = {"dataset": dataset, "config": to_plain(CONFIG), "cells": _cells()}
+    with partial_records(out) as record_path:
+        records = collect_records(
+            record_path,
+            header,
+            partial(SceneTester, path),
+            indices,
+            schema=SceneRecord,
+            workers=workers,
         )
-    ]
-    rows = [
-        {
-            "cell": name,
-            "solvable": fraction(sum(not part[name] for part in found), len(found)),
-            "unrevealable_by_class": Counter(
-                unrevealable.rsplit("_", 1)[0] for part in found for unrevealable in part[name]
-            ),
+        found = [record["unrevealable"] for record in records]
+        rows = [
+            {
+                "cell": name,
+                "solvable": fraction(sum(not part[name] for part in found), len(found)),
+                "unrevealable_by_class": Counter(
+                    unrevealable.rsplit("_", 1)[0] for part in found for unrevealable in part[name]
+                ),
+            }
+            for name in CELLS
+        ]
+        command = f"scenes --dataset {dataset} --workers {workers}"
+        fields = {
+            "command": f"benchmarks/gripper_coverage.py {command}",
+            "dataset": dataset,
+            "count": len(found),
+            "cells": _cells(),
+            "rows": rows,
         }
-        for name in CELLS
-    ]
-    command = f"scenes --dataset {dataset} --workers {workers}"
-    fields = {
-        "command": f"benchmarks/gripper_coverage.py {command}",
-        "dataset": dataset,
-        "count": len(found),
-        "cells": _cells(),
-        "rows": rows,
-    }
-    write_results(out, fields)
+        write_results(out, fields)
 
 
 def moves(
@@ -189,31 +219,40 @@ def moves(
 ) -> None:
     """Plan random legal moves in stable scenes of the random generator."""
     numbers = range(math.ceil(count / MOVES_PER_SCENE))
-    by_scene = map_ordered(partial(MovePlanner, nodes, seed), numbers, workers=workers)
-    trials = [trial for part in progress(by_scene, "scenes", len(numbers)) for trial in part]
-    rows = []
-    for name in CELLS:
-        of_cell = [trial for trial in trials if trial.cell == name][:count]
-        failed = [trial for trial in of_cell if trial.result != PLANNED]
-        rows.append(
-            {
-                "cell": name,
-                "results": Counter(trial.result for trial in of_cell),
-                "tools": Counter(trial.tool for trial in of_cell if trial.tool),
-                "failed_by_class": Counter(f"{t.object_class}: {t.result}" for t in failed),
-                "collisions": Counter(t.detail for t in failed if t.result == "in collision"),
-            }
+    header = {"nodes": nodes, "seed": seed, "config": to_plain(CONFIG), "cells": _cells()}
+    with partial_records(out) as record_path:
+        records = collect_records(
+            record_path,
+            {**header, "planner": asdict(PLANNER)},
+            partial(MovePlanner, nodes, seed),
+            numbers,
+            schema=SceneTrials,
+            workers=workers,
         )
-    command = f"moves --count {count} --nodes {nodes} --seed {seed} --workers {workers}"
-    fields = {
-        "command": f"benchmarks/gripper_coverage.py {command}",
-        "seed": seed,
-        "count": count,
-        "cells": _cells(),
-        "planner": asdict(PLANNER),
-        "rows": rows,
-    }
-    write_results(out, fields)
+        trials = [PlannedTrial(**trial) for record in records for trial in record["trials"]]
+        rows = []
+        for name in CELLS:
+            of_cell = [trial for trial in trials if trial.cell == name][:count]
+            failed = [trial for trial in of_cell if trial.result != PLANNED]
+            rows.append(
+                {
+                    "cell": name,
+                    "results": Counter(trial.result for trial in of_cell),
+                    "tools": Counter(trial.tool for trial in of_cell if trial.tool),
+                    "failed_by_class": Counter(f"{t.object_class}: {t.result}" for t in failed),
+                    "collisions": Counter(t.detail for t in failed if t.result == "in collision"),
+                }
+            )
+        command = f"moves --count {count} --nodes {nodes} --seed {seed} --workers {workers}"
+        fields = {
+            "command": f"benchmarks/gripper_coverage.py {command}",
+            "seed": seed,
+            "count": count,
+            "cells": _cells(),
+            "planner": asdict(PLANNER),
+            "rows": rows,
+        }
+        write_results(out, fields)
 
 
 def _cells() -> dict[str, Any]:

@@ -92,7 +92,7 @@ class TiltedPicker:
         self._seed = seed
         self._judge = DrakeJudge(CONFIG)
         self._detector = LabelDetector(CONFIG.cell.camera)
-        self._executor = ArmExecutor(CONFIG, planner_config=PlannerConfig(optimize=False))
+        self._executor = ArmExecutor(CONFIG)
         self._classes = load_catalog().object_set("ycb7")
 
     def sample_scene(self, rng: np.random.Generator) -> tuple[Scene, float]:
@@ -163,19 +163,19 @@ def main(
             schema=TiltedPick,
             workers=workers,
         )
-    planned = [record for record in records if record["planned"]]
-    carried_out = [record for record in planned if record["result"] == CARRIED_OUT]
-    command = f"benchmarks/tilted_picks.py --count {count} --seed {seed} --workers {workers}"
-    fields = {
-        "command": command,
-        "count": count,
-        **header,
-        "planned": fraction(len(planned), len(records)),
-        "carried_out": fraction(len(carried_out), len(records)),
-        "results": Counter(record["result"] for record in records),
-        "by_class": Counter(f"{r['object_class']}: {r['result']}" for r in records),
-    }
-    write_results(out, fields)
+        planned = [record for record in records if record["planned"]]
+        carried_out = [record for record in planned if record["result"] == CARRIED_OUT]
+        command = f"benchmarks/tilted_picks.py --count {count} --seed {seed} --workers {workers}"
+        fields = {
+            "command": command,
+            "count": count,
+            **header,
+            "planned": fraction(len(planned), len(records)),
+            "carried_out": fraction(len(carried_out), len(records)),
+            "results": Counter(record["result"] for record in records),
+            "by_class": Counter(f"{r['object_class']}: {r['result']}" for r in records),
+        }
+        write_results(out, fields)
 
 
 if __name__ == "__main__":
