@@ -3,7 +3,8 @@
     python benchmarks/tilted_picks.py --count 300 --seed 51 --out tilted_picks.json
 
 An object is laid against another one at a random tilt and settles. Scenes in which it comes to rest
-tilted by 5 to 30 degrees count. An interrupted run is resumed by the same command.
+tilted by 5 to 30 degrees count, if the other one stays in its place without it: a lying can may be
+wedged by what leans on it. An interrupted run is resumed by the same command.
 """
 
 import math
@@ -22,6 +23,7 @@ from benchmarks.pick_place import (
     OutOption,
     execution_result,
     fraction,
+    is_unstable_when_teleported,
     write_results,
 )
 from drake_clutter.catalog import ObjectClass, load_catalog
@@ -46,6 +48,8 @@ MIN_TILT_DEG = 5.0
 """Smallest tilt of the picked object [deg]."""
 MAX_TILT_DEG = 30.0
 """Largest tilt of the picked object [deg]."""
+MAX_SUPPORT_DISPLACEMENT = 0.0025
+"""Largest displacement of the other object without the leaning one, with the judge's offset [m]."""
 LEANING, SUPPORT = "leaning", "support"
 """Names of the picked object and of what it leans on."""
 
@@ -59,12 +63,14 @@ class TiltedPick:
         tilt_deg: Its tilt [deg].
         planned: Whether there is a plan.
         result: Why there is no plan, or how its execution ended.
+        unstable_anyway: Whether a teleported move makes the scene unstable, too.
     """
 
     object_class: str
     tilt_deg: float
     planned: bool
     result: str
+    unstable_anyway: bool = False
 
 
 def lower_onto(object_class: ObjectClass, R: np.ndarray[Any, Any], xy: Any, bottom: float) -> Pose:
@@ -125,7 +131,11 @@ class TiltedPicker:
             verdict = self._judge.judge(settled, rng)
             at_rest = settled.with_poses(verdict.settled)
             found = resting_tilt(leaning, at_rest[LEANING].X_TO.rotation)
-            if verdict.stable and MIN_TILT_DEG <= math.degrees(found) <= MAX_TILT_DEG:
+            if not verdict.stable or not MIN_TILT_DEG <= math.degrees(found) <= MAX_TILT_DEG:
+                continue
+            alone = self._judge.judge(Scene((at_rest[SUPPORT],), scene.support), rng)
+            moved = alone.settled[SUPPORT].p - at_rest[SUPPORT].X_TO.p
+            if alone.stable and float(np.linalg.norm(moved)) < MAX_SUPPORT_DISPLACEMENT:
                 return at_rest, found
 
     def __call__(self, number: int) -> TiltedPick:
@@ -143,7 +153,8 @@ class TiltedPicker:
         if not isinstance(plan, PickPlacePlan):
             return TiltedPick(name, degrees, False, plan.reason.value)
         result = execution_result(StationSimulation(default_cell(), scene).execute(plan))
-        return TiltedPick(name, degrees, True, result)
+        unstable = result != CARRIED_OUT and is_unstable_when_teleported(scene, plan)
+        return TiltedPick(name, degrees, True, result, unstable)
 
 
 def main(
@@ -172,6 +183,9 @@ def main(
             **header,
             "planned": fraction(len(planned), len(records)),
             "carried_out": fraction(len(carried_out), len(records)),
+            "carried_out_unless_unstable_anyway": fraction(
+                len(carried_out), sum(not record["unstable_anyway"] for record in records)
+            ),
             "results": Counter(record["result"] for record in records),
             "by_class": Counter(f"{r['object_class']}: {r['result']}" for r in records),
         }

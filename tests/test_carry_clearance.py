@@ -27,7 +27,7 @@ from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.scenes.scene import Pose, SceneObject
-from drake_clutter.simulation.scene_plant import rigid_transform
+from drake_clutter.simulation.scene_plant import pose_from_transform, rigid_transform
 from drake_clutter.station.station_simulation import StationSimulation
 
 DOWN = RollPitchYaw(np.pi, 0.0, 0.0).ToRotationMatrix()
@@ -113,6 +113,29 @@ def fitted(p_place: tuple[float, float, float]) -> list[Column]:
     X_TG = tool_poses([BOX.X_TO.translation, p_place])
     columns = columns_below(BOX, placed, GRASP, X_TG, CarryClearance(hidden_margin=0.013))
     return [column for column in columns if column is not None]
+
+
+def test_a_column_leaves_room_for_a_box_that_is_turned_at_the_other_end() -> None:
+    """The nearest side is oblique to the column: a margin in both axes grows faster along it."""
+    x, y, z = BOX.X_TO.translation
+    length, width, _ = BOX.object_class.size
+    for degrees in (0.0, 30.0, 45.0):
+        turn = RollPitchYaw(0.0, 0.0, math.radians(degrees)).ToRotationMatrix()
+        for gap in (0.002, 0.004):
+            c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+            distance = (length + length * c + width * s) / 2 + gap
+            p = (x + distance * c, y + distance * s, z - 0.05)
+            placed = replace(BOX, X_TO=pose_from_transform(RigidTransform(turn, p)))
+            ends = [
+                RigidTransform(R @ DOWN, q) for R, q in ((RotationMatrix(), (x, y, z)), (turn, p))
+            ]
+            X_TG = np.array([X.GetAsMatrix4() for X in ends])
+            errors = CarryClearance(hidden_margin=0.013)
+            below_pick, _ = columns_below(BOX, placed, GRASP, X_TG, errors)
+            assert below_pick is not None
+            box = CarriedBox.along(BOX.object_class, GRASP, X_TG[1:])
+            found = float(below_pick.slack(box, 0.0, 0.0).values[0])
+            assert found == pytest.approx(0.0, abs=1e-9), "it is as wide as there is room"
 
 
 def test_columns_leave_room_for_the_object_at_the_other_end() -> None:

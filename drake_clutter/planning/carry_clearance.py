@@ -175,9 +175,11 @@ class Column:
             The column, or None if the object is placed where the column would be: what stands below
             is narrower, and known.
         """
-        room = float(self._separate(box)[0][0])
+        (room,), (normal,), _ = self._separate(box)
         if room >= 0:
-            return replace(self, half_size=self.half_size + min(margin, room))
+            # The reach of a wider base grows in both axes where the normal is oblique to them.
+            growth = float(np.abs(self.axes @ normal).sum())
+            return replace(self, half_size=self.half_size + min(margin, float(room) / growth))
         if box.corners[0, :, 2].min() < self.top - _TOLERANCE:
             return None
         return replace(self, anchors=np.array([self.anchors[0], anchor]))
