@@ -99,6 +99,15 @@ from .recording.recorded_episode import (
     RecordedEpisode as RecordedEpisode,
 )
 from .scenes.action_samples import ActionSamples as ActionSamples
+from .recording.camera_recorder import CameraChannel as CameraChannel
+from .recording.formats.dataset_format import DatasetFormat as DatasetFormat
+from .recording.randomization import RandomizationConfig as RandomizationConfig
+from .commands.episode_scenes import find_scenes as find_scenes
+from .commands.record_dataset import (
+    CameraOptions as CameraOptions,
+    RecordingJob as RecordingJob,
+    record_dataset as record_dataset,
+)
 
 # The closed loop.
 from .systems.closed_loop import ClosedLoop as ClosedLoop

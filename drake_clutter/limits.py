@@ -20,3 +20,5 @@ MAX_IMAGE_SIDE = 4096
 """Largest width and height of an image [pixels]; its rendering takes seconds."""
 MAX_SAMPLES = 1_000_000
 """Largest number of samples of a recorded move, which last hours."""
+MAX_SAMPLE_RATE = 1000.0
+"""Largest number of samples or images per second [Hz]: more than the plant has steps."""

@@ -36,6 +36,7 @@ from drake_clutter.cli import app
 from drake_clutter.commands import feasibility_parts
 from drake_clutter.commands.explore_scene import read_moves
 from drake_clutter.config import load_config
+from drake_clutter.recording.randomization import RandomizationConfig, load_randomization
 from drake_clutter.reports import feasibility_cases
 from drake_clutter.scenes.scene_file import load_scene
 from drake_clutter.systems.scenario import Scenario
@@ -60,12 +61,13 @@ LANGUAGES = {"console", "python", "sh", "yaml"}
 """Languages whose blocks are executed."""
 OTHER_LANGUAGES = {"bibtex", "json", "text", "xml"}
 
-SMALLER = {"--count": "1", "--max-scenes": "1", "--workers": "1"}
+SMALLER = {"--count": "1", "--episodes": "1", "--max-scenes": "1", "--workers": "1"}
 """Values that options of commands are given instead."""
 ADDED = {
     "05_train_generator": ["--steps", "64", "--scenes", "1"],
     "evaluate": ["--max-moves", "1", "--max-scenes", "1"],
     "explore": ["--max-moves", "1"],
+    "record": ["--max-moves", "1", "--resolution", "64x48"],
     "run": ["--set", "max_moves=1"],
     "render_image_dataset": [],
     "train_detector": [
@@ -220,6 +222,8 @@ def load_yaml(block: Block, folder: Path, page: str) -> None:
         load_scene(path, load_catalog())
     elif "agent" in fields:
         load_config_as(Scenario(), path)
+    elif fields <= {*RandomizationConfig.model_fields}:
+        load_randomization(str(path))
     elif fields <= {"layout", "settle", "exploration", "cell"}:
         load_config(path)
     else:

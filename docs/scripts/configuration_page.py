@@ -12,6 +12,7 @@ from pydantic.fields import FieldInfo
 from docstrings import docstring_section, docstring_summary
 from drake_clutter.config import ClutterConfig
 from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.recording.randomization import RandomizationConfig
 from drake_clutter.systems.scenario import Scenario
 from drake_clutter.validation import InRange
 from markdown_text import table
@@ -33,6 +34,11 @@ ROOTS: tuple[tuple[str, str, type], ...] = (
         "Closed-loop scenario",
         "Fields of `drake-clutter run --scenario` files and of its `--set`.",
         Scenario,
+    ),
+    (
+        "Randomization of recorded episodes",
+        "Fields of files for `drake-clutter record --randomize`.",
+        RandomizationConfig,
     ),
     ("Motion planner", "Argument of `PickPlacePlanner`; not a field of a file.", PlannerConfig),
     (

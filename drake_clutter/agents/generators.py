@@ -239,9 +239,7 @@ class SceneGenerator:
 
     def __call__(self, index: int) -> GeneratedScene:
         """Generate and judge a scene that depends only on the job and an index."""
-        rng = item_rng(self._job.seed, index)
-        scene, failures = self.lay_out(rng)
-        verdict = self._judge.judge(scene, rng)
+        scene, verdict, failures = self.generate(index)
         solvability = None
         if verdict.stable:
             result = self._search.solve(
@@ -249,6 +247,12 @@ class SceneGenerator:
             )
             solvability = result.solvability
         return GeneratedScene(scene, verdict, failures, solvability)
+
+    def generate(self, index: int) -> tuple[Scene, Verdict, Counter[str]]:
+        """Return the scene of an index, its verdict, and the layout failures before it."""
+        rng = item_rng(self._job.seed, index)
+        scene, failures = self.lay_out(rng)
+        return scene, self._judge.judge(scene, rng), failures
 
     def lay_out(self, rng: np.random.Generator) -> tuple[Scene, Counter[str]]:
         """Derive graphs until one can be laid out.

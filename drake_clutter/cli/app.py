@@ -13,6 +13,7 @@ from drake_clutter.cli.export import export
 from drake_clutter.cli.feasibility import feasibility
 from drake_clutter.cli.generate import generate
 from drake_clutter.cli.move import move
+from drake_clutter.cli.record import record
 from drake_clutter.cli.renamed import RenamingCommand
 from drake_clutter.cli.render import render
 from drake_clutter.cli.replay import replay
@@ -35,6 +36,7 @@ for command in (
     solve,
     run,
     demo,
+    record,
     feasibility,
     replay,
     view,

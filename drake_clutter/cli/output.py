@@ -87,7 +87,11 @@ def print_episode(episode: Mapping[str, Any], as_json: bool, out: Path) -> None:
 
 
 def progress_bar(
-    description: str, items: Iterable[Item], num_done: int, total: int
+    description: str,
+    items: Iterable[Item],
+    num_done: int,
+    total: int,
+    status: Callable[[Item], str] = lambda item: "",
 ) -> Iterator[Item]:
     """Yield items while a progress bar on standard error counts them.
 
@@ -99,9 +103,13 @@ def progress_bar(
         items: The items; the bar appears when the first is requested.
         num_done: Number of items that an earlier run has finished.
         total: Number of items, including those.
+        status: Returns the text beside the bar after an item.
     """
     with redirect_stdout(sys.stderr), _progress(description) as bar:
-        yield from bar.track(items, total=total, completed=num_done)
+        task = bar.add_task("", total=total, completed=num_done, status="")
+        for item in items:
+            yield item
+            bar.update(task, advance=1, status=status(item))
 
 
 @contextmanager
@@ -113,7 +121,7 @@ def counter(description: str, most: int) -> Iterator[Callable[[], None]]:
         most: Number of calls at most.
     """
     with _progress(description) as bar:
-        task = bar.add_task("", total=most)
+        task = bar.add_task("", total=most, status="")
         yield lambda: bar.advance(task)
 
 
@@ -125,6 +133,7 @@ def _progress(description: str) -> Progress:
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
+        TextColumn("{task.fields[status]}"),
     )
     return Progress(*columns, console=err_console)
 

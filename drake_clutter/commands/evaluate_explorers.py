@@ -55,12 +55,16 @@ class EvaluationScene:
     num_objects: int
 
 
-def load_evaluation_scenes(source: str, catalog_folder: Path | None) -> list[EvaluationScene]:
-    """Return the stable scenes with hidden objects of a folder or a scene dataset.
+def load_evaluation_scenes(
+    source: str, catalog_folder: Path | None, *, with_hidden_objects: bool = True
+) -> list[EvaluationScene]:
+    """Return the scenes of a folder or a scene dataset.
 
     Args:
         source: Folder of scene files, scene dataset file, or name of a shipped scene dataset.
         catalog_folder: Asset folder with the user's object classes, or None.
+        with_hidden_objects: Whether scene files are left out that are not stable with hidden
+            objects. Otherwise those are left out that a judge has found not to be stable.
 
     Raises:
         InputError: There is no such source, a file cannot be used, or no scene is suitable.
@@ -93,15 +97,22 @@ def load_evaluation_scenes(source: str, catalog_folder: Path | None) -> list[Eva
     evaluation_scenes = []
     for path in paths:
         file = load_scene(path, catalog)
-        if file.verdict is not None and file.verdict.hidden:
+        verdict = file.verdict
+        is_suitable = (
+            verdict is not None and bool(verdict.hidden)
+            if with_hidden_objects
+            else verdict is None or verdict.stable
+        )
+        if is_suitable:
             names = frozenset(o.object_class.name for o in file.scene.objects)
             evaluation_scenes.append(
                 EvaluationScene(path, None, names, file.cell, len(file.scene.objects))
             )
     if not evaluation_scenes:
+        wanted = "is stable and has hidden objects" if with_hidden_objects else "is stable"
         raise InputError(
-            f"{scenes}: none of {len(paths)} scenes is stable and has hidden objects; expected "
-            "scenes that `generate` judged so"
+            f"{scenes}: none of {len(paths)} scenes {wanted}; expected scenes that `generate` "
+            "judged so"
         )
     return evaluation_scenes
 

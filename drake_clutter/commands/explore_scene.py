@@ -32,8 +32,8 @@ from drake_clutter.scenes.scene_file import save_scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.drake_judge import DrakeJudge
 from drake_clutter.station.arm_executor import ArmExecutor
-from drake_clutter.tasks.belief import Belief, Decision
-from drake_clutter.tasks.episode import run_episode
+from drake_clutter.tasks.belief import Belief, Decision, Policy
+from drake_clutter.tasks.episode import Backend, run_episode
 from drake_clutter.tasks.exploration_task import ExplorationTask, TerminationReason, Transition
 from drake_clutter.validation import NonEmptyText, StrictModel, to_plain, validate
 from drake_clutter.yaml_io import read_yaml
@@ -118,6 +118,27 @@ def _check_move(moves: Sequence[Move], index: int, visible: Sequence[str], scene
             raise InputError(f"move {index + 1}, {role}: {name!r} {problem}; expected {choices}")
 
 
+def move_list_policy(moves: Sequence[Move], backend: Backend) -> Policy:
+    """Return the policy of an episode that attempts a list of moves.
+
+    It raises an InputError if a move names an object that is not visible.
+
+    Args:
+        moves: The moves.
+        backend: Backend of the episode.
+    """
+
+    def next_move(belief: Belief, observation: Observation, rng: np.random.Generator) -> Decision:
+        """Return the next move of the list; a `Policy`."""
+        index = len(belief.history)
+        if index == len(moves):
+            return Decision(None)
+        _check_move(moves, index, [d.name for d in observation.detections], backend.scene)
+        return Decision(moves[index])
+
+    return next_move
+
+
 def execute_moves(
     scene: Scene,
     moves: Sequence[Move],
@@ -141,17 +162,9 @@ def execute_moves(
     """
     backend = make_backend_factory(fidelity, config, simulate_collapse=True)(scene, item_rng(seed))
 
-    def next_move(belief: Belief, observation: Observation, rng: np.random.Generator) -> Decision:
-        """Return the next move of the list; a `Policy`."""
-        index = len(belief.history)
-        if index == len(moves):
-            return Decision(None)
-        _check_move(moves, index, [d.name for d in observation.detections], backend.scene)
-        return Decision(moves[index])
-
     return run_episode(
         backend,
-        next_move,
+        move_list_policy(moves, backend),
         max_moves=len(moves),
         on_transition=on_transition,
         stop_when_all_found=False,

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from drake_clutter.outputs import check_folder_is_empty, find_result, output_fol
 from drake_clutter.validation import to_plain, validate
 
 JOB_FILE = "job.json"
+_MAX_NAMED_FIELDS = 3
+"""Number of differing fields that a message names."""
 _RENAMED_FIELDS = {
     "catalogue_folder": "catalog_folder",
     "dropped_share": "heap_fraction",
@@ -97,16 +100,26 @@ def _check_same_job(path: Path, job: Mapping[str, Any]) -> None:
             f"--out {out}: cannot be resumed, because its {JOB_FILE} is not one of this version "
             f"({error}); give another folder"
         ) from error
-    # Fields are compared as text, because the order of cameras matters, too.
-    fields, earlier_fields = (
-        {key: json.dumps(value) for key, value in document.items()}
-        for document in (job, earlier_job)
-    )
-    if fields != earlier_fields:
+    differing = ", ".join(islice(_differing_fields(job, earlier_job), _MAX_NAMED_FIELDS))
+    if differing:
         raise InputError(
-            f"--out {out}: holds results of other options, see {JOB_FILE}; give the same options "
-            "or another folder"
+            f"--out {out}: holds results of other options, see {JOB_FILE} (differs in {differing});"
+            " give the same options or another folder"
         )
+
+
+def _differing_fields(job: Mapping[str, Any], other: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the names of the fields in which two documents differ, such as "config.layout"."""
+    for key in dict.fromkeys([*job, *other]):
+        value, other_value = job.get(key), other.get(key)
+        if isinstance(value, dict) and isinstance(other_value, dict):
+            # The order of cameras matters, too.
+            if [*value] == [*other_value]:
+                yield from (f"{key}.{name}" for name in _differing_fields(value, other_value))
+            else:
+                yield key
+        elif key not in job or key not in other or json.dumps(value) != json.dumps(other_value):
+            yield key
 
 
 def _read_job(path: Path) -> dict[str, Any]:

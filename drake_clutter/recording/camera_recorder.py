@@ -10,7 +10,7 @@ from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import MakeRenderEngineVtk, QueryObject
+from pydrake.geometry import QueryObject
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation
@@ -20,16 +20,13 @@ from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.files import InputError
 from drake_clutter.perception.depth_noise import add_depth_noise
-from drake_clutter.recording.appearance import apply_colors, engine_params
+from drake_clutter.recording.appearance import vary_colors, vary_lighting
 from drake_clutter.recording.randomization import Variation
 from drake_clutter.recording.recorded_episode import CameraImages
 from drake_clutter.scenes.action_samples import ActionSamples
 from drake_clutter.scenes.scene import Scene
-from drake_clutter.simulation.camera_renderer import (
-    RENDERER_NAME,
-    RenderCameras,
-)
 from drake_clutter.simulation.cell_plant import add_work_cell, joint_state_indices
+from drake_clutter.simulation.plant_rasterizer import PlantRasterizer
 from drake_clutter.simulation.scene_plant import (
     add_scene_plant,
     pose_from_transform,
@@ -182,10 +179,9 @@ def _stack_frames(camera: Camera, time: Floats, frames: Sequence[_Frame]) -> Cam
 
 
 class CameraRecorder:
-    """Renders the images of one scene with one engine, in which arm and objects are moved.
+    """Renders the images of one scene, in which arm and objects are moved.
 
-    Robot, gripper, fixtures, support and objects are shown at their recorded positions. An engine
-    of its own for each scene makes images independent of those that were rendered before.
+    Robot, gripper, fixtures, support and objects are shown at their recorded positions.
 
     Attributes:
         cameras: The cameras.
@@ -242,16 +238,15 @@ class CameraRecorder:
             visuals=True,
         )
         plant.Finalize()
-        apply_colors(self._scene_plant, variation)
-        engine = MakeRenderEngineVtk(engine_params(variation))
-        self._scene_plant.scene_graph.AddRenderer(RENDERER_NAME, engine)
+        vary_colors(self._scene_plant, variation)
+        self._lighting = vary_lighting(variation)
+        self._rasterizer = PlantRasterizer(self._scene_plant.scene_graph.model_inspector())
         self._q_indices, _ = joint_state_indices(plant, self._arm)
         self._diagram = builder.Build()
         self._context = self._diagram.CreateDefaultContext()
         self._plant_context = plant.GetMyMutableContextFromRoot(self._context)
         self._names = scene.names
         self._scene_plant.set_poses(self._plant_context, scene.objects)
-        self._render_cameras = [RenderCameras.from_camera(c.camera) for c in self.cameras]
         self._labels = np.zeros(2**15, np.uint8)
         self._labels[[int(body.index()) for body in self._arm.bodies]] = ARM_LABEL
         for number, name in enumerate(self._names, start=1):
@@ -295,21 +290,20 @@ class CameraRecorder:
         X_TC = self.cameras[number].camera.X_TC @ self._X_CA[number]
         if self.cameras[number].is_on_flange:
             X_TC = self._arm.flange.CalcPoseInWorld(self._plant_context) @ X_TC
-        render = self._render_cameras[number]
-        query = self._query()
-        world = self._scene_plant.scene_graph.world_frame_id()
+        images = self._rasterizer.render(
+            self.cameras[number].camera, X_TC, self._query(), self._lighting
+        )
         rgb = depth = segmentation = None
         if CameraChannel.RGB in self.channels:
-            image = query.RenderColorImage(render.color, world, X_TC)
-            rgb = self._add_color_noise(image.data[..., :3])
+            rgb = self._add_color_noise(images.color)
         if CameraChannel.DEPTH in self.channels:
-            measured = query.RenderDepthImage(render.depth, world, X_TC).data[..., 0]
+            measured = images.depth
             if self._variation.depth_noise:
                 measured = add_depth_noise(measured, self._rng)
             depth = depth_in_millimeters(measured)
         if CameraChannel.SEGMENTATION in self.channels:
-            image = query.RenderLabelImage(render.color, world, X_TC)
-            segmentation = self._labels[image.data[..., 0]]
+            # The last label of the table is that of pixels in which nothing is seen, -1.
+            segmentation = self._labels[images.label]
         pose = pose_from_transform(X_TC)
         return _Frame((*pose.quaternion, *pose.translation), rgb, depth, segmentation)
 

@@ -32,7 +32,7 @@ support's frame is the world of every simulation. Images are in
 """
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from enum import Enum
 from pathlib import Path
@@ -52,7 +52,13 @@ from drake_clutter.files import (
     parse_json,
     reading_file,
 )
-from drake_clutter.limits import MAX_COUNT, MAX_IMAGE_SIDE, MAX_SAMPLES, MAX_SEED
+from drake_clutter.limits import (
+    MAX_COUNT,
+    MAX_IMAGE_SIDE,
+    MAX_SAMPLE_RATE,
+    MAX_SAMPLES,
+    MAX_SEED,
+)
 from drake_clutter.recording.hdf5_version_1 import read_version_1
 from drake_clutter.recording.recorded_episode import (
     CameraImages,
@@ -78,8 +84,6 @@ FORMAT_VERSION = 2
 """Version of the files that are written."""
 MAX_ACTIONS = 10_000
 """Largest number of actions of an episode, which take a day."""
-MAX_RATE = 1000.0
-"""Largest number of samples per second [Hz]: more than the plant has steps."""
 MAX_TIME_STEP = 0.1
 """Largest time step of a simulation [s]: objects fall through others within it."""
 MAX_OBJECTS = 10_000
@@ -118,7 +122,12 @@ def action_name(number: int) -> str:
     return f"action_{number:04d}"
 
 
-def save_episode(path: Path, episode: RecordedEpisode) -> None:
+def save_episode(
+    path: Path,
+    episode: RecordedEpisode,
+    *,
+    record_images: Callable[[ActionSamples], Mapping[str, CameraImages]] | None = None,
+) -> None:
     """Write an episode to a file, which appears when it is complete.
 
     The same episode gives the same bytes.
@@ -126,6 +135,8 @@ def save_episode(path: Path, episode: RecordedEpisode) -> None:
     Args:
         path: File to write.
         episode: The episode.
+        record_images: Returns the images of the samples of an action, by name of the camera, which
+            are needed one action at a time; None for the images of the episode.
     """
     # In memory, because HDF5 reports a full disk only when it closes a file, and not as OSError.
     with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
@@ -150,6 +161,8 @@ def save_episode(path: Path, episode: RecordedEpisode) -> None:
             }
         )
         for number, action in enumerate(episode.actions, start=1):
+            if record_images is not None and action.samples is not None:
+                action = replace(action, images=record_images(action.samples))
             _write_action(file.create_group(action_name(number)), action, axes)
         file.flush()
         image = file.id.get_file_image()
@@ -273,7 +286,7 @@ def load_episode(path: Path, catalog: Catalog, *, images: bool = True) -> Record
             variation=_read_variation(path, reader.text("variation")),
             seed=reader.integer("seed", -1, MAX_SEED),
             index=reader.integer("index", 0, MAX_COUNT),
-            rate=reader.quantity("rate", MAX_RATE),
+            rate=reader.quantity("rate", MAX_SAMPLE_RATE),
         )
         axes = episode.axes
         if len(file) > MAX_ACTIONS:

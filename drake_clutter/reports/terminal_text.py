@@ -41,6 +41,20 @@ def evaluation_table_rows(
     return rows
 
 
+def describe_dataset(summary: Mapping[str, Any]) -> dict[str, str]:
+    """Return the `summary.json` of a recorded data set as texts by label."""
+    rows = {
+        "episodes": f"{summary['episodes']:,}",
+        "moves": f"{summary['moves']:,}, {summary['executed_moves']:,} of them carried out",
+        "results": _counts(summary["results"]),
+        "ends of episodes": _counts(summary["terminations"]),
+        "recorded motion": f"{summary['recorded_seconds'] / 3600:.2f} h",
+    }
+    if summary["errors"]:
+        rows["policy errors"] = f"{len(summary['errors']):,} episodes"
+    return rows
+
+
 def describe_generation(summary: Mapping[str, Any]) -> dict[str, str]:
     """Return the `summary.json` of generated scenes as texts by label."""
     rows = {

@@ -4,6 +4,7 @@ Frames: W is the world, C the camera, G a geometry.
 """
 
 from collections.abc import Hashable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,16 +38,23 @@ from drake_clutter.rendering.visual_mesh import (
     scaled_visual,
 )
 
+Color = tuple[float, float, float]
+"""Linear red, green and blue."""
+
+TINT = ("drake_clutter", "tint")
+"""Group and name of a perception property: linear factor on the colors of a mesh file, `Rgba`."""
+_NO_TINT = Rgba(1.0, 1.0, 1.0, 1.0)
 _DEFAULT_COLOR = Rgba(0.9, 0.9, 0.9, 1.0)
 """Color of geometry that has none, that of Drake's VTK engine."""
 
 
-def _visuals_of(shape: Shape, color: tuple[float, ...], name: str) -> tuple[VisualMesh, ...]:
+def _visuals_of(shape: Shape, color: Color, tint: Color, name: str) -> tuple[VisualMesh, ...]:
     """Return the meshes of a shape in its frame.
 
     Args:
         shape: The shape.
         color: Red, green and blue in [0, 1], of shapes without a material of their own.
+        tint: Factors on red, green and blue of the materials of files.
         name: Name of the geometry for messages.
 
     Raises:
@@ -64,13 +72,19 @@ def _visuals_of(shape: Shape, color: tuple[float, ...], name: str) -> tuple[Visu
         return (scaled_visual(capsule_visual(1.0, 0.0, color), (shape.a(), shape.b(), shape.c())),)
     if isinstance(shape, Mesh | Convex) and shape.source().is_path():
         parts = load_visual_meshes(Path(shape.source().path()))
-        return tuple(scaled_visual(part, shape.scale3()) for part in parts)
+        return tuple(_tinted(scaled_visual(part, shape.scale3()), tint) for part in parts)
     raise InputError(f"{name}: the compiled renderer draws no {type(shape).__name__}")
 
 
-def _shape_key(shape: Shape, color: tuple[float, ...]) -> Hashable:
+def _tinted(mesh: VisualMesh, tint: Color) -> VisualMesh:
+    """Return a mesh whose color is multiplied by a tint."""
+    red, green, blue = (a * b for a, b in zip(mesh.color, tint, strict=True))
+    return replace(mesh, color=(red, green, blue))
+
+
+def _shape_key(shape: Shape, color: Color, tint: Color) -> Hashable:
     """Return what is equal for shapes with the same meshes."""
-    return repr(shape), color
+    return repr(shape), color, tint
 
 
 class PlantRasterizer:
@@ -100,9 +114,11 @@ class PlantRasterizer:
                 continue
             color = rgba.r(), rgba.g(), rgba.b()
             shape = inspector.GetShape(geometry)
-            key = _shape_key(shape, color)
+            factors = properties.GetPropertyOrDefault(*TINT, _NO_TINT)
+            tint = factors.r(), factors.g(), factors.b()
+            key = _shape_key(shape, color, tint)
             if key not in by_shape:
-                parts = _visuals_of(shape, color, inspector.GetName(geometry))
+                parts = _visuals_of(shape, color, tint, inspector.GetName(geometry))
                 by_shape[key] = range(len(meshes), len(meshes) + len(parts))
                 meshes += parts
             label = properties.GetPropertyOrDefault("label", "id", RenderLabel.kUnspecified)

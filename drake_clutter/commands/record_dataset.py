@@ -1,0 +1,384 @@
+"""Recording of a data set of episodes with the arm, parallel and resumable.
+
+Each episode is a file, which appears when it is complete. A data set is resumed by recording the
+episodes whose files are missing, so nothing is lost or repeated, however a run ends. The content of
+an episode depends only on the job and on its number, not on the number of workers.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+import drake_clutter
+from drake_clutter.agents.explorers import (
+    PRETRAINED_EXPLORERS,
+    PolicyFactory,
+    make_policy_factory,
+)
+from drake_clutter.catalog import load_catalog
+from drake_clutter.commands.episode_scenes import SceneSource
+from drake_clutter.commands.explore_scene import move_list_policy
+from drake_clutter.commands.job_file import open_job_folder
+from drake_clutter.config import ClutterConfig
+from drake_clutter.files import reading_file, write_json
+from drake_clutter.learning.pretrained import checkpoint_sha256
+from drake_clutter.recording.appearance import NUM_LIGHTS, colored_parts
+from drake_clutter.recording.camera_recorder import (
+    CameraChannel,
+    CameraRecorder,
+    RecordedCamera,
+    find_cameras,
+)
+from drake_clutter.recording.episode_recorder import record_episode
+from drake_clutter.recording.formats.dataset_format import (
+    DatasetFormat,
+    check_format,
+    convert_episodes,
+)
+from drake_clutter.recording.hdf5_file import FORMAT_VERSION, load_episode, save_episode
+from drake_clutter.recording.randomization import (
+    RandomizationConfig,
+    Variation,
+    draw_variation,
+    varied_physics,
+    vary_poses,
+)
+from drake_clutter.recording.recorded_episode import RecordedEpisode
+from drake_clutter.scenes.interfaces import Move, MoveResult
+from drake_clutter.scenes.scene import Scene
+from drake_clutter.seeding import item_rng
+from drake_clutter.simulation.drake_judge import DrakeJudge
+from drake_clutter.station.motion_recorder import DEFAULT_RATE
+from drake_clutter.tasks.belief import Policy
+from drake_clutter.validation import to_plain
+from drake_clutter.workers.parallel_map import map_ordered
+
+EPISODES_FOLDER = "episodes"
+"""Folder of the recorded episodes in that of a data set."""
+SUMMARY_FILE = "summary.json"
+MAX_PHYSICS_ATTEMPTS = 10
+"""Number of drawn masses and frictions with which a scene may be unstable, one after the other."""
+_VARIATION, _POSES, _NOISE = range(1, 4)
+"""Last elements of the paths of an episode's random generators, beside that of `record_episode`."""
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """Which images are recorded.
+
+    Attributes:
+        names: Names of the cameras; see `find_cameras`. None are rendered without names.
+        channels: Kinds of images.
+        resolution: Width and height [px]; None for those of each camera.
+        rate: Images per second [Hz].
+    """
+
+    names: tuple[str, ...] = ()
+    channels: tuple[CameraChannel, ...] = (CameraChannel.RGB, CameraChannel.DEPTH)
+    resolution: tuple[int, int] | None = None
+    rate: float = 10.0
+
+    def find(self, config: ClutterConfig) -> tuple[RecordedCamera, ...]:
+        """Return the cameras in the cell of a configuration."""
+        return find_cameras(config.cell, self.names, self.resolution)
+
+
+@dataclass(frozen=True)
+class RecordingJob:
+    """Everything that determines a data set but the number of its episodes.
+
+    Attributes:
+        scenes: Scenes of the episodes.
+        policy: Name of an exploration policy, see `make_policy_factory`, whose episodes end when
+            every object has been seen; a list of moves, which are attempted in every scene; or a
+            function, whose episodes end when it has no move.
+        config: Configuration of the simulated world.
+        seed: Seed of policies, placements, simulation and randomization.
+        rate: Samples per second [Hz].
+        max_moves: Largest number of moves of an episode; None for that of the configuration.
+        cameras: Which images are recorded.
+        randomization: What is varied from episode to episode.
+        catalog_folder: Asset folder with the user's object classes, or None.
+    """
+
+    scenes: SceneSource
+    policy: str | tuple[Move, ...] | Policy
+    config: ClutterConfig
+    seed: int = 0
+    rate: float = DEFAULT_RATE
+    max_moves: int | None = None
+    cameras: CameraOptions = field(default_factory=CameraOptions)
+    randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
+    catalog_folder: Path | None = None
+
+    @property
+    def policy_name(self) -> str:
+        """Name of the policy."""
+        if isinstance(self.policy, str):
+            return self.policy
+        if isinstance(self.policy, tuple):
+            return "moves"
+        return getattr(self.policy, "__qualname__", type(self.policy).__qualname__)
+
+    def make_policy_factory(self) -> PolicyFactory:
+        """Return the factory of the policies of the episodes.
+
+        Raises:
+            InputError: There is no such policy, or it does not know the classes of the scenes.
+        """
+        policy = self.policy
+        if isinstance(policy, str):
+            return make_policy_factory(policy, self.config, self.scenes.classes)
+        if isinstance(policy, tuple):
+            return partial(move_list_policy, policy)
+        return lambda _: policy
+
+    def check(self) -> None:
+        """Raise an InputError if the policy or a camera does not exist."""
+        self.make_policy_factory()
+        self.cameras.find(self.config)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything that determines the data set, for JSON."""
+        moves = [asdict(move) for move in self.policy] if isinstance(self.policy, tuple) else None
+        weights = (
+            checkpoint_sha256(self.policy, PRETRAINED_EXPLORERS)
+            if isinstance(self.policy, str)
+            else None
+        )
+        return {
+            "command": "record",
+            "version": FORMAT_VERSION,
+            "package_version": drake_clutter.__version__,
+            "scenes": self.scenes.to_dict(),
+            "policy": self.policy_name,
+            "weights": weights,
+            "moves": moves,
+            "seed": self.seed,
+            "rate": self.rate,
+            "max_moves": self.max_moves,
+            "cameras": {
+                "names": [*self.cameras.names],
+                "channels": [channel.value for channel in self.cameras.channels],
+                "resolution": self.cameras.resolution and [*self.cameras.resolution],
+                "rate": self.cameras.rate,
+            },
+            "randomization": to_plain(self.randomization),
+            "catalog_folder": str(self.catalog_folder.resolve()) if self.catalog_folder else None,
+            "config": to_plain(self.config),
+        }
+
+
+@dataclass(frozen=True)
+class EpisodeSummary:
+    """Outcome of a recorded episode.
+
+    Attributes:
+        index: Number of the episode.
+        scene: Name of the scene.
+        termination: Why it ended.
+        error: Message of the exception of the policy; "" for none.
+        results: Values of the `MoveResult` of the attempted moves.
+        duration: Duration of all motions [s].
+    """
+
+    index: int
+    scene: str
+    termination: str
+    error: str
+    results: tuple[str, ...]
+    duration: float
+
+    @property
+    def num_executed(self) -> int:
+        """Number of moves that were carried out."""
+        return sum(MoveResult(result).was_executed for result in self.results)
+
+
+def episode_path(out: Path, index: int) -> Path:
+    """Return the file of an episode in the folder of a data set."""
+    return out / EPISODES_FOLDER / f"episode_{index:06d}.h5"
+
+
+def read_summary(path: Path) -> EpisodeSummary:
+    """Return the outcome of a recorded episode without reading its samples.
+
+    Raises:
+        InputError: The file cannot be read.
+    """
+    with reading_file(path, "a recorded episode"), h5py.File(path) as file:
+        actions = [file[name] for name in sorted(file)]
+        times = [action["time"] for action in actions if "time" in action]
+        return EpisodeSummary(
+            index=int(file.attrs["index"]),
+            scene=str(file.attrs["scene_name"]),
+            termination=str(file.attrs["termination"]),
+            error=str(file.attrs["error"]),
+            results=tuple(str(action.attrs["result"]) for action in actions),
+            duration=float(sum(time[-1] for time in times)),
+        )
+
+
+class EpisodeWriter:
+    """Records episodes by their numbers and writes their files; a worker for `map_ordered`."""
+
+    def __init__(self, job: RecordingJob, out: Path) -> None:
+        """Create a worker.
+
+        Args:
+            job: The data set.
+            out: Its folder.
+        """
+        self._job = job
+        self._out = out
+        self._load_scene = job.scenes.make_loader(job.config)
+        self._make_policy = job.make_policy_factory()
+        self._cameras = job.cameras.find(job.config)
+
+    def __call__(self, index: int) -> EpisodeSummary:
+        """Record an episode, write its file, and return its outcome."""
+        job = self._job
+        nominal, name = self._load_scene(index)
+        nominal = vary_poses(nominal, job.randomization, item_rng(job.seed, index, _POSES))
+        for variation in self._draw_variations(nominal, index):
+            with varied_physics(nominal, variation) as scene:
+                if variation.mass or variation.friction:
+                    verdict = DrakeJudge(job.config).judge(scene, item_rng(job.seed, index, 0))
+                    if not verdict.stable:
+                        continue
+                    scene = scene.with_poses(verdict.settled)
+                episode = record_episode(
+                    scene,
+                    self._make_policy,
+                    job.config,
+                    seed=job.seed,
+                    policy_name=job.policy_name,
+                    index=index,
+                    scene_name=name,
+                    rate=job.rate,
+                    max_moves=job.max_moves,
+                    stop_when_all_found=isinstance(job.policy, str),
+                )
+            break
+        episode = replace(
+            episode,
+            initial_scene=nominal.with_poses(episode.initial_scene.poses),
+            variation=variation.to_dict(),
+        )
+        self._save(episode, variation)
+        return read_summary(episode_path(self._out, index))
+
+    def _draw_variations(self, scene: Scene, index: int) -> Iterator[Variation]:
+        """Yield variations until one suits the scene; the last one has the nominal masses."""
+        job = self._job
+        rng = item_rng(job.seed, index, _VARIATION)
+        for _ in range(MAX_PHYSICS_ATTEMPTS):
+            variation = draw_variation(
+                job.randomization,
+                scene.objects,
+                colored_parts(job.config.cell),
+                [camera.name for camera in self._cameras],
+                NUM_LIGHTS,
+                rng,
+            )
+            yield variation
+        yield replace(variation, mass={}, friction={})
+
+    def _save(self, episode: RecordedEpisode, variation: Variation) -> None:
+        """Write an episode with its images."""
+        job = self._job
+        path = episode_path(self._out, episode.index)
+        if not self._cameras:
+            save_episode(path, episode)
+            return
+        recorder = CameraRecorder(
+            episode.cell,
+            episode.initial_scene,
+            self._cameras,
+            job.cameras.channels,
+            variation,
+            item_rng(job.seed, episode.index, _NOISE),
+        )
+        record_images = partial(recorder.record, rate=job.cameras.rate)
+        save_episode(path, episode, record_images=record_images)
+
+
+Progress = Callable[[Iterable[EpisodeSummary], int, int], Iterable[EpisodeSummary]]
+"""Wraps the new episodes, given the number of existing episodes and of all episodes."""
+
+
+def record_dataset(
+    job: RecordingJob,
+    num_episodes: int,
+    formats: Sequence[DatasetFormat],
+    out: Path,
+    *,
+    workers: int = 1,
+    ray_address: str | None = None,
+    progress: Progress = lambda episodes, num_done, total: episodes,
+) -> dict[str, Any]:
+    """Record a data set, or go on with an interrupted or shorter one of the same job.
+
+    An exception of the policy ends its episode, which is recorded with the message; the others go
+    on.
+
+    Args:
+        job: The data set.
+        num_episodes: Number of episodes at the end.
+        formats: Formats of the data set; the recorded episodes are HDF5 files in any case.
+        out: Folder of the data set.
+        workers: Number of worker processes.
+        ray_address: Address of the Ray cluster that runs the workers; None runs them locally.
+        progress: Wraps the new episodes.
+
+    Returns:
+        The summary, the content of `summary.json`.
+
+    Raises:
+        InputError: The policy or a camera does not exist, a package that a format needs is missing,
+            or the folder holds another data set.
+    """
+    job.check()
+    for dataset_format in formats:
+        check_format(dataset_format)
+    with open_job_folder(out, job.to_dict()):
+        (out / EPISODES_FOLDER).mkdir(exist_ok=True)
+        paths = [episode_path(out, index) for index in range(num_episodes)]
+        missing = [index for index, path in enumerate(paths) if not path.exists()]
+        new_episodes = map_ordered(
+            partial(EpisodeWriter, job, out), missing, workers=workers, ray_address=ray_address
+        )
+        for _ in progress(new_episodes, num_episodes - len(missing), num_episodes):
+            pass
+        catalog = load_catalog(job.catalog_folder)
+        for dataset_format in formats:
+            episodes = (load_episode(path, catalog) for path in paths)
+            convert_episodes(dataset_format, episodes, out)
+        summary = summarize_dataset([read_summary(path) for path in paths])
+        write_json(out / SUMMARY_FILE, summary)
+    return summary
+
+
+def summarize_dataset(episodes: Sequence[EpisodeSummary]) -> dict[str, Any]:
+    """Return counts of the episodes and moves of a data set.
+
+    Args:
+        episodes: Outcomes of all episodes.
+    """
+    results = Counter(result for episode in episodes for result in episode.results)
+    executed = sum(episode.num_executed for episode in episodes)
+    return {
+        "episodes": len(episodes),
+        "moves": sum(results.values()),
+        "executed_moves": executed,
+        "results": dict(results.most_common()),
+        "terminations": dict(Counter(e.termination for e in episodes).most_common()),
+        "recorded_seconds": float(np.sum([e.duration for e in episodes])),
+        "errors": {e.index: e.error for e in episodes if e.error},
+    }

@@ -1,0 +1,212 @@
+"""Data sets of recorded episodes: resumed, reproducible, and whole whatever happens."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import CATALOG, DEFAULT_CELL, WORLD, resting, scene_of
+from typer.testing import CliRunner
+
+from drake_clutter.cli.app import app
+from drake_clutter.commands.episode_scenes import FileScenes, find_scenes
+from drake_clutter.commands.record_dataset import (
+    CameraOptions,
+    EpisodeSummary,
+    RecordingJob,
+    episode_path,
+    record_dataset,
+)
+from drake_clutter.files import InputError
+from drake_clutter.recording.camera_recorder import CameraChannel
+from drake_clutter.recording.hdf5_file import load_episode
+from drake_clutter.recording.randomization import load_randomization
+from drake_clutter.scenes.interfaces import Move, MoveResult, Observation
+from drake_clutter.scenes.scene_file import save_scene
+from drake_clutter.tasks.belief import Belief, Decision
+
+CAMERAS = CameraOptions(("wrist",), (CameraChannel.RGB, CameraChannel.SEGMENTATION), (64, 48))
+
+
+def pick_can_or_refuse(
+    belief: Belief, observation: Observation, rng: np.random.Generator
+) -> Decision:
+    """Raise an error if there is no can, else have no move; a `Policy`."""
+    if "can" not in [d.name for d in observation.detections]:
+        raise RuntimeError("there is no can")
+    return Decision(None)
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> FileScenes:
+    folder = tmp_path_factory.mktemp("scenes")
+    boxes = {"a": "gelatin_box", "b": "pudding_box"}
+    for name, box in boxes.items():
+        scene = scene_of(resting(box, name="box"), resting("sugar_box", xy=(0.2, 0.2), name="far"))
+        save_scene(folder / f"{name}.yaml", scene, DEFAULT_CELL)
+    with_can = scene_of(resting("master_chef_can", name="can"))
+    save_scene(folder / "c.yaml", with_can, DEFAULT_CELL)
+    found = find_scenes(str(folder), WORLD)
+    assert isinstance(found, FileScenes)
+    return found
+
+
+@pytest.fixture(scope="module")
+def job(scenes: FileScenes) -> RecordingJob:
+    """Return a job of one move in each episode: the box onto the tray."""
+    return RecordingJob(
+        FileScenes(scenes.scenes[:2], None),
+        policy=(Move("box"),),
+        config=WORLD,
+        seed=3,
+        max_moves=1,
+        cameras=CAMERAS,
+        randomization=load_randomization("mass,poses,textures,lights,camera,noise"),
+    )
+
+
+@pytest.fixture(scope="module")
+def dataset(job: RecordingJob, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("dataset")
+    summary = record_dataset(job, 2, [], out)
+    assert summary["episodes"] == 2
+    assert summary["executed_moves"] == 2
+    assert summary["errors"] == {}
+    return out
+
+
+def test_episodes_hold_what_the_job_asked_for(job: RecordingJob, dataset: Path) -> None:
+    episodes = [load_episode(episode_path(dataset, index), CATALOG) for index in range(2)]
+    assert [e.scene_name for e in episodes] == ["a", "b"]
+    assert [e.object_classes[0] for e in episodes] == ["gelatin_box", "pudding_box"]
+    assert [e.index for e in episodes] == [0, 1]
+    assert {e.seed for e in episodes} == {3}
+    assert {e.policy for e in episodes} == {"moves"}
+    for episode in episodes:
+        (action,) = episode.actions
+        assert action.move == Move("box")
+        assert action.result is MoveResult.PLACED
+        assert action.samples is not None
+        images = action.images["wrist"]
+        assert images.rgb is not None
+        assert images.rgb.shape[1:] == (48, 64, 3)
+        assert images.depth is None
+        assert images.time[-1] == action.samples.time[-1]
+        assert set(np.unique(images.segmentation)) >= {0, 1, 255}  # type: ignore[arg-type]
+        nominal = episode.initial_scene["box"].object_class.mass
+        assert episode.variation["mass"]["box"] != nominal
+        assert episode.variation["mass"]["box"] == pytest.approx(nominal, rel=0.2)
+        # The box is where the images show it: below the wrist camera's tool when it is grasped.
+        held = action.samples.held_object == 0
+        assert held.any()
+    masses = [e.variation["mass"]["far"] for e in episodes]
+    assert masses[0] != masses[1]
+
+
+def test_a_missing_episode_is_recorded_again_with_the_same_bytes(
+    job: RecordingJob, dataset: Path
+) -> None:
+    first, second = (episode_path(dataset, index) for index in range(2))
+    before = second.read_bytes()
+    time = first.stat().st_mtime_ns
+    second.unlink()
+    (second.parent / f".{second.stem}.tmp-00000000.h5").write_bytes(before[:1000])
+    done = list[EpisodeSummary]()
+
+    def progress(episodes: Any, num_done: int, total: int) -> Any:
+        assert (num_done, total) == (1, 2)
+        for episode in episodes:
+            done.append(episode)
+            yield episode
+
+    summary = record_dataset(job, 2, [], dataset, progress=progress)
+    assert [episode.index for episode in done] == [1]
+    assert done[0].num_executed == 1
+    # The worker has recorded no other episode before: nothing depends on what it did.
+    assert second.read_bytes() == before
+    assert first.stat().st_mtime_ns == time
+    assert summary["executed_moves"] == 2
+    assert sorted(p.name for p in second.parent.iterdir()) == [first.name, second.name]
+
+
+def test_a_policy_that_raises_ends_only_its_episodes(scenes: FileScenes, tmp_path: Path) -> None:
+    job = RecordingJob(scenes, pick_can_or_refuse, WORLD)
+    summary = record_dataset(job, 4, [], tmp_path)
+    message = "RuntimeError: there is no can"
+    assert summary["errors"] == {0: message, 1: message, 3: message}
+    assert summary["terminations"] == {"policy error": 3, "all found": 1}
+    assert load_episode(episode_path(tmp_path, 3), CATALOG).error == message
+    document = json.loads((tmp_path / "job.json").read_text())
+    assert document["policy"] == "pick_can_or_refuse"
+    # A longer data set keeps the episodes.
+    assert record_dataset(job, 5, [], tmp_path)["episodes"] == 5
+
+
+def test_a_folder_of_another_job_is_refused(
+    job: RecordingJob, dataset: Path, scenes: FileScenes
+) -> None:
+    cell = DEFAULT_CELL.model_copy(
+        update={"robot": DEFAULT_CELL.robot.model_copy(update={"payload": 5.0})}
+    )
+    other = RecordingJob(
+        job.scenes, job.policy, WORLD.__class__(cell=cell), 3, 125.0, 1, CAMERAS, job.randomization
+    )
+    with pytest.raises(InputError, match=r"differs in config\.cell\.robot\.payload\)"):
+        record_dataset(other, 2, [], dataset)
+    document = json.loads((dataset / "job.json").read_text())
+    (dataset / "job.json").write_text(json.dumps(document | {"version": 1}))
+    with pytest.raises(InputError, match=r"differs in version\)"):
+        record_dataset(job, 2, [], dataset)
+    (dataset / "job.json").write_text(json.dumps(document))
+    assert load_episode(episode_path(dataset, 0), CATALOG).index == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--cameras", "side"), "--cameras side: expected some of"),
+        (("--channels", "rgb,color"), "--channels color: expected some of rgb, depth"),
+        (("--resolution", "640"), "--resolution 640: expected WIDTHxHEIGHT, each from 16 to 4096"),
+        (("--randomize", "all"), "--randomize all: expected some of poses, mass"),
+        (("--policy", "clever"), "clever; expected random"),
+        (("--policy", "none.yaml"), "none.yaml"),
+        (("--set", "support.size=[0.6,0.6]"), "the support is that of the scene"),
+    ],
+)
+def test_a_mistake_is_one_line(
+    options: tuple[str, str], message: str, scenes: FileScenes, tmp_path: Path
+) -> None:
+    folder = str(scenes.scenes[0].file.parent)
+    out = tmp_path / "out"
+    result = CliRunner().invoke(app, ["record", "--scenes", folder, "--out", str(out), *options])
+    assert isinstance(result.exception, InputError)
+    assert message in str(result.exception)
+    assert "\n" not in str(result.exception)
+    assert not out.exists()
+
+
+def test_unknown_scenes_are_named() -> None:
+    with pytest.raises(InputError, match=r"--scenes nowhere: does not exist"):
+        find_scenes("nowhere", WORLD)
+
+
+def test_a_generator_gives_each_episode_a_stable_scene() -> None:
+    source = find_scenes("random", WORLD, nodes=5, seed=5)
+    load = source.make_loader(WORLD)
+    (first, name), (second, _) = load(0), load(1)
+    assert first.poses != second.poses
+    assert name.startswith("random ")
+    assert {o.object_class.name for o in first.objects} <= source.classes
+
+
+def test_the_command_prints_counts_and_the_first_error(scenes: FileScenes, tmp_path: Path) -> None:
+    folder = str(scenes.scenes[0].file.parent)
+    moves = tmp_path / "moves.yaml"
+    moves.write_text("- {pick: nothing, place: tray}\n")
+    arguments = ["record", "--scenes", folder, "--out", str(tmp_path / "out"), "--episodes", "2"]
+    result = CliRunner().invoke(app, [*arguments, "--policy", str(moves), "--json"])
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["episodes"] == 2
+    warning = "warning the policy raised in 2 of 2 episodes, first in episode 0: InputError: move 1"
+    assert warning in result.stderr
