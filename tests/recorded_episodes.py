@@ -24,7 +24,8 @@ SCENE = scene_of(
     resting("gelatin_box", xy=(0.1, 0.1)),
     resting("large_marker", xy=(0.2, -0.2)),
 )
-PLACE = Pose((-0.2, 0.15, 0.02), (1.0, 0.0, 0.0, 0.0))
+PLACE = (-0.2, 0.15, 0.02)
+"""Position at which every object is placed, without a turn [m]."""
 HOME = np.array([0.0, -1.8, 1.8, -1.6, -1.57, 0.0])
 IMAGE_SIZE = (32, 48)
 """Height and width of the images [px]."""
@@ -48,7 +49,6 @@ def synthetic_samples(
     poses = np.array([[*o.X_TO.quaternion, *o.X_TO.translation] for o in scene.objects])
     X_TO = np.tile(poses, (len(time), 1, 1))
     carried = np.clip((s - 0.25) / 0.5, 0.0, 1.0)[:, None]
-    X_TO[:, index, :4] = place.quaternion
     X_TO[:, index, 4:] = (1 - carried) * scene[pick].X_TO.p + carried * place.p
     X_TG = np.tile([0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.3], (len(time), 1))
     X_TG[:, 4:] += X_TO[:, index, 4:]
@@ -113,13 +113,23 @@ def synthetic_episode(
     actions = list[RecordedAction]()
     scene = SCENE
     for pick, result in (("gelatin_box", MoveResult.PLACED), ("pudding_box", MoveResult.DROPPED)):
-        samples = synthetic_samples(scene, pick, PLACE, rate)
+        place = replace(scene[pick].X_TO, translation=PLACE)
+        samples = synthetic_samples(scene, pick, place, rate)
         images = {
             name: synthetic_images(samples, every, depth=True)
             for name, every in (cameras or {}).items()
         }
         detail = "" if result is MoveResult.PLACED else "pudding_box came off"
-        action = RecordedAction(Move(pick), result, detail, "", "", "large", PLACE, samples, images)
+        action = RecordedAction(
+            Move(pick),
+            result,
+            detail=detail,
+            tool="large",
+            X_TO_place=place,
+            believed=scene.poses,
+            samples=samples,
+            images=images,
+        )
         actions.append(action)
         scene = scene.with_poses(
             {
@@ -128,7 +138,11 @@ def synthetic_episode(
             }
         )
     unplanned = RecordedAction(
-        Move("large_marker"), MoveResult.NOT_PLANNED, "no grasp", "no grasp of the object"
+        Move("large_marker"),
+        MoveResult.NOT_PLANNED,
+        detail="large_marker",
+        failure_reason="no grasp",
+        believed=scene.poses,
     )
     return RecordedEpisode(
         initial_scene=SCENE,

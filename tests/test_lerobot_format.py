@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from pyarrow import parquet
-from recorded_episodes import PLACE, PRESSURE, image_level, synthetic_episode
+from recorded_episodes import PLACE, PRESSURE, SCENE, image_level, synthetic_episode
 
 from drake_clutter.files import InputError
 from drake_clutter.recording.formats import lerobot
@@ -59,7 +59,7 @@ def test_rows_hold_measured_states_and_the_next_commands(
     objects = rows["observation.environment_state"][:ROWS]
     assert objects[:, :7] == pytest.approx(samples.X_TO[::2, 1], abs=1e-6)
     assert objects[:, 7:] == pytest.approx(
-        np.tile([*PLACE.quaternion, *PLACE.translation], (ROWS, 1)), abs=1e-6
+        np.tile([*SCENE["gelatin_box"].X_TO.quaternion, *PLACE], (ROWS, 1)), abs=1e-6
     )
     assert rows["timestamp"][:ROWS] == pytest.approx(np.arange(ROWS) / 10)
     assert (rows["episode_index"] == np.repeat(range(4), ROWS)).all()

@@ -12,6 +12,7 @@ from drake_clutter.cli.explore import explore
 from drake_clutter.cli.export import export
 from drake_clutter.cli.feasibility import feasibility
 from drake_clutter.cli.generate import generate
+from drake_clutter.cli.inspect import inspect
 from drake_clutter.cli.move import move
 from drake_clutter.cli.record import record
 from drake_clutter.cli.renamed import RenamingCommand
@@ -38,6 +39,7 @@ for command in (
     demo,
     record,
     feasibility,
+    inspect,
     replay,
     view,
     render,

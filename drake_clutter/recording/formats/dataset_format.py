@@ -10,7 +10,7 @@ Each is written from recorded episodes below the folder of the data set:
 """
 
 import importlib.util
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from enum import Enum
 from pathlib import Path
 
@@ -80,3 +80,23 @@ def convert_episodes(format: DatasetFormat, episodes: Iterable[RecordedEpisode],
         from drake_clutter.recording.formats.robomimic import write_robomimic
 
         write_robomimic(out / "robomimic.hdf5", episodes)
+    elif format is DatasetFormat.RERUN:
+        from drake_clutter.recording.formats.rerun import write_rerun
+
+        _write_files(out / "rerun", ".rrd", episodes, write_rerun)
+    elif format is DatasetFormat.MCAP:
+        from drake_clutter.recording.formats.mcap import write_mcap
+
+        _write_files(out / "mcap", ".mcap", episodes, write_mcap)
+
+
+def _write_files(
+    folder: Path,
+    suffix: str,
+    episodes: Iterable[RecordedEpisode],
+    write: Callable[[Path, RecordedEpisode], None],
+) -> None:
+    """Write a file for each episode."""
+    folder.mkdir(exist_ok=True)
+    for episode in episodes:
+        write(folder / f"episode_{episode.index:06d}{suffix}", episode)
