@@ -246,7 +246,7 @@ def test_the_plan_starts_at_the_tool_at_home(
     assert (points[0].x, points[0].y, points[0].z) == pytest.approx(p_TG, abs=1e-6)
 
 
-def testshape_meshes_of_shapes_and_files(tmp_path: Path) -> None:
+def test_meshes_of_shapes_and_files(tmp_path: Path) -> None:
     (box,) = shape_meshes(Box(0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 1.0))
     assert box.extents == pytest.approx([0.1, 0.2, 0.3])
     visual: Any = box.visual

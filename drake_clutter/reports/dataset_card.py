@@ -103,7 +103,8 @@ def _thumbnail(episode: RecordedEpisode) -> tuple[NDArray[np.uint8], str, bool] 
         None if no action was executed.
     """
     placed = sum(action.result is MoveResult.PLACED for action in episode.actions)
-    caption = f"{episode.index}: {placed} of {len(episode.actions)} placed, {episode.termination}"
+    caption = f"episode {episode.index}, {placed} of {len(episode.actions)} placed: "
+    caption += episode.termination
     is_success = not any(action.result.ends_episode for action in episode.actions)
     for action in episode.actions:
         if action.samples is None:
@@ -133,7 +134,7 @@ def _render(episode: RecordedEpisode, samples: ActionSamples, row: int) -> NDArr
     }
     image = recorder.record(replace(samples, **channels), episode.rate)[OBLIQUE].rgb
     assert image is not None
-    return image[0]
+    return np.asarray(image[0])
 
 
 def _card(episodes: Sequence[EpisodeFigures], format: DatasetFormat, text: CardText) -> str:

@@ -10,6 +10,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from drake_clutter.files import atomic_write
@@ -90,6 +91,7 @@ def _plot_counts(axes: Any, title: str, counts: Counter[str], colors: Sequence[s
     axes.set_yticks(positions, [name for name, _ in bars])
     axes.set_ylim(max(len(bars), 4) - 0.5, -0.5)
     axes.margins(x=0.15)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     axes.grid(axis="y", visible=False)
 
 
@@ -98,7 +100,7 @@ def _plot_classes(axes: Any, episodes: Sequence[EpisodeFigures]) -> None:
     rows = attempted(episodes)
     counts = Counter(row.object_class for row in rows)
     placed = Counter(row.object_class for row in rows if row.result is MoveResult.PLACED)
-    _plot_counts(axes, "class of the picked object (green: placed)", counts)
+    _plot_counts(axes, "picked classes (green: placed)", counts)
     names = [name for name, _ in counts.most_common(MAX_BARS)]
     names = names if len(counts) <= MAX_BARS else names[:-1]
     axes.barh(np.arange(len(names)), [placed[n] for n in names], color=_COLORS["good"], height=0.65)
@@ -116,6 +118,9 @@ def _plot_histogram(axes: Any, title: str, values: Sequence[float]) -> None:
     median = float(np.median(values))
     axes.axvline(median, color="#22272e", linestyle="--", label=f"median {median:.3g}")
     axes.set_ylabel("number")
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+    if is_whole:
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     axes.legend()
 
 
@@ -123,7 +128,7 @@ def _plot_limits(
     axes: Any, episodes: Sequence[EpisodeFigures], found: Sequence[MotionFigures]
 ) -> None:
     """Plot the largest speed and torque of each joint in each move, relative to its limit."""
-    axes.set_title("largest speed and torque of a move over the limit")
+    axes.set_title("largest speed and torque over limit")
     joints = episodes[0].joints
     rows = [row for row in found if len(row.speed_ratios) == len(joints)]
     if not rows:
@@ -148,8 +153,8 @@ def _plot_limits(
     axes.axhline(1.0, color=_COLORS["bad"], linestyle="--", label="limit")
     axes.set_xticks(np.arange(len(joints)), [f"{k + 1}" for k in range(len(joints))])
     axes.set_xlabel("joint")
-    axes.set_ylim(0, None)
-    axes.legend(loc="lower right")
+    axes.set_ylim(0, 1.3)
+    axes.legend(loc="upper center", ncols=3)
 
 
 def _plot_heat_map(
@@ -170,7 +175,9 @@ def _plot_heat_map(
         vmax=max(1.0, float(counts.max())),
     )
     axes.grid(visible=False)
-    axes.figure.colorbar(image, ax=axes, label="moves")
+    bar = axes.figure.colorbar(image, ax=axes, label="moves")
+    bar.locator = MaxNLocator(integer=True, min_n_ticks=1)
+    bar.update_ticks()
 
 
 def _show_nothing(axes: Any) -> None:

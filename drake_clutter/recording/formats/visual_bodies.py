@@ -34,7 +34,7 @@ from drake_clutter.recording.recorded_episode import RecordedEpisode
 from drake_clutter.scenes.action_samples import ActionSamples
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.simulation.cell_plant import add_work_cell, joint_state_indices
-from drake_clutter.simulation.scene_plant import add_scene_plant, pose_from_transform
+from drake_clutter.simulation.scene_plant import add_scene_plant
 
 WORLD = "cell"
 """Name of the body of everything that is fixed: support, pedestal and fixtures."""
@@ -152,8 +152,9 @@ class _CellBodies:
             self._plant.SetPositions(self._context, positions)
             self._plant.SetPositions(self._context, self._arm.gripper, gripper_row)
             for name, body in self._links.items():
-                pose = pose_from_transform(body.EvalPoseInWorld(self._context))
-                poses[name][row] = (*pose.quaternion, *pose.translation)
+                X_TB = body.EvalPoseInWorld(self._context)
+                poses[name][row, :4] = X_TB.rotation().ToQuaternion().wxyz()
+                poses[name][row, 4:] = X_TB.translation()
         return poses
 
     def tool_positions(self, q: NDArray[np.float64], tool: str) -> NDArray[np.float64]:
