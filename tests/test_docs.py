@@ -105,6 +105,7 @@ PARSED = {
     "evaluate_generators",
     "exported_stability",
     "judge_agreement",
+    "mujoco_motion",
     "mutation_testing",
     "random_generator_calibration",
 }
