@@ -82,20 +82,49 @@ def _edge_shift(luminosity, row, column, is_horizontal):  # type: ignore[no-unty
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _contrasts(here, up, down, contrasts):  # type: ignore[no-untyped-def]
+    """Write the range of luminosity among each pixel and its neighbors; 0 if it is too small.
+
+    Args:
+        here: Luminosities of the row, one more at each end. Shape (width + 2,).
+        up: Luminosities of the row above. Shape (width,).
+        down: Luminosities of the row below. Shape (width,).
+        contrasts: Output. Shape (width,).
+    """
+    for k in range(len(contrasts)):
+        w, c, e, n, s = here[k], here[k + 1], here[k + 2], up[k], down[k]
+        lowest = w if w < c else c
+        lowest = e if e < lowest else lowest
+        lowest = n if n < lowest else lowest
+        lowest = s if s < lowest else lowest
+        highest = w if w > c else c
+        highest = e if e > highest else highest
+        highest = n if n > highest else highest
+        highest = s if s > highest else highest
+        least = _RELATIVE_CONTRAST * highest
+        least = least if least > _HARD_CONTRAST else _HARD_CONTRAST
+        contrast = highest - lowest
+        contrasts[k] = np.float32(0.0) if contrast < least else contrast
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _smooth(color, luminosity, smooth):  # type: ignore[no-untyped-def]
     """Write the pixels that are smoothed, see `smooth_edges`."""
     height, width = luminosity.shape
+    padded = np.empty(width + 2, np.float32)
+    contrasts = np.empty(width, np.float32)
     for row in range(height):
         above, below = max(row - 1, 0), min(row + 1, height - 1)
         here, up, down = luminosity[row], luminosity[above], luminosity[below]
+        padded[0], padded[width + 1] = here[0], here[width - 1]
+        padded[1 : width + 1] = here
+        _contrasts(padded, up, down, contrasts)
         for column in range(width):
+            contrast = contrasts[column]
+            if contrast == 0.0:
+                continue
             left, right = max(column - 1, 0), min(column + 1, width - 1)
             c, n, s, w, e = here[column], up[column], down[column], here[left], here[right]
-            lowest = min(min(min(n, s), min(w, e)), c)
-            highest = max(max(max(n, s), max(w, e)), c)
-            contrast = highest - lowest
-            if contrast < max(_HARD_CONTRAST, _RELATIVE_CONTRAST * highest):
-                continue
             nw, ne, sw, se = up[left], up[right], down[left], down[right]
             deviation = abs(np.float32(0.25) * (n + s + w + e) - c) / contrast
             blend = max(np.float32(0.0), deviation - _SUBPIXEL_CONTRAST)
@@ -120,9 +149,16 @@ def _smooth(color, luminosity, smooth):  # type: ignore[no-untyped-def]
                 smooth[row, column, k] = np.uint8(edge + blend * (mean - edge) + np.float32(0.5))
 
 
-def smooth_edges(color: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return an image with smooth edges. Shape (height, width, 3)."""
-    luminosity = np.empty(color.shape[:2], np.float32)
+def smooth_edges(color: NDArray[np.uint8], luminosity: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return an image with smooth edges.
+
+    Args:
+        color: The image. Shape (height, width, 3).
+        luminosity: Scratch memory. Shape (height, width).
+
+    Returns:
+        New image. Shape (height, width, 3).
+    """
     _luminosity(color, _LUMINOSITY.astype(np.float32), luminosity)
     smooth = color.copy()
     _smooth(color, luminosity, smooth)

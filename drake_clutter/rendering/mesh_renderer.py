@@ -6,7 +6,7 @@ G is the frame of a mesh, L the view frame of a lamp.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.pinhole import MAX_DEPTH
 from drake_clutter.rendering.antialiasing import smooth_edges
 from drake_clutter.rendering.lighting import Lamp, LampKind, Lighting
-from drake_clutter.rendering.rasterizer import NUM_COEFFICIENTS, View, draw, pack_meshes
+from drake_clutter.rendering.rasterizer import NUM_COEFFICIENTS, View, draw, pack_meshes, resolve
 from drake_clutter.rendering.shading import (
     LampArrays,
     make_decoding_table,
@@ -78,13 +78,6 @@ class _Drawing(NamedTuple):
     surfaces: NDArray[np.float32]
     owner: NDArray[np.int64]
 
-    def label(self, labels: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the label image for labels of instances, shape (n,); -1 where nothing is seen."""
-        background = len(labels)
-        # The entry of the background is the last, to which -1 refers.
-        owner = np.append(self.owner, background)
-        return np.asarray(np.append(labels, -1)[owner[self.hit]])
-
 
 def _compose(X_AB: Floats, X_BC: Floats) -> Floats:
     """Return X_AC for X_AB (3, 4) and X_BC (n, 3, 4) [m]."""
@@ -125,6 +118,7 @@ class MeshRenderer:
         self._corners = np.array([b[choice, np.arange(3)] for b in bounds])
         self._num_triangles = np.array([len(mesh.triangles) for mesh in meshes])
         self._tables = make_decoding_table(), make_encoding_table()
+        self._scratch = dict[str, NDArray[Any]]()
 
     def render(
         self, camera: Camera, X_WC: Floats, instances: MeshInstances, lighting: Lighting
@@ -138,8 +132,8 @@ class MeshRenderer:
             lighting: Light of the color image.
         """
         drawing = self._draw(camera, X_WC, instances)
-        color = np.empty((camera.height, camera.width, 3), np.uint8)
-        color[:] = lighting.background
+        size = camera.height, camera.width
+        color = self._memory("color", (*size, 3), np.uint8)
         shade(
             self._arrays,
             instances.mesh_ids,
@@ -150,10 +144,12 @@ class MeshRenderer:
             self._lamp_arrays(lighting, _invert(X_WC), instances.mesh_ids, drawing.X_CG),
             np.float32(lighting.ambient * lighting.exposure),
             self._tables,
+            lighting.background,
             color,
         )
+        depth, label = _resolve_images(drawing, instances.labels)
         return RenderedImages(
-            smooth_edges(color), _depth_image(drawing.nearest), drawing.label(instances.labels)
+            smooth_edges(color, self._memory("luminosity", size, np.float32)), depth, label
         )
 
     def render_depth_and_label(
@@ -161,14 +157,17 @@ class MeshRenderer:
     ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """Return the depth and label images, see `render`."""
         drawing = self._draw(camera, X_WC, instances)
-        return _depth_image(drawing.nearest), drawing.label(instances.labels)
+        return _resolve_images(drawing, instances.labels)
 
     def _draw(self, camera: Camera, X_WC: Floats, instances: MeshInstances) -> _Drawing:
         """Return what is seen from a camera, see `render`."""
         X_CG = _compose(_invert(X_WC), instances.X_WG)
         view = View(camera.focal_length, *camera.principal_point, True, NEAR_DEPTH)
-        nearest = np.zeros((camera.height, camera.width), np.float32)
-        hit = np.full(nearest.shape, -1, np.int32)
+        size = camera.height, camera.width
+        nearest = self._memory("nearest", size, np.float32)
+        hit = self._memory("hit", size, np.int32)
+        nearest[:] = 0.0
+        hit[:] = -1
         count = max(int(self._num_triangles[instances.mesh_ids].sum()), 1)
         surfaces = np.empty((count, NUM_COEFFICIENTS), np.float32)
         owner = np.zeros(count, np.int64)
@@ -182,7 +181,9 @@ class MeshRenderer:
         count = len(lighting.lamps)
         vectors = np.zeros((count, 3))
         shadow_map = np.full(count, -1)
-        maps = list[NDArray[np.float32]]()
+        num_maps = sum(lamp.casts_shadows for lamp in lighting.lamps) if len(mesh_ids) else 0
+        size = SHADOW_MAP_SIZE
+        maps = self._memory("maps", (num_maps, size, size), np.float32)
         poses = list[Floats]()
         views = list[View]()
         for k, lamp in enumerate(lighting.lamps):
@@ -194,19 +195,15 @@ class MeshRenderer:
                 vectors[k] = vector if lamp.is_on_camera else X_CW[:, :3] @ vector + X_CW[:, 3]
             if lamp.casts_shadows and len(mesh_ids):
                 X_LC, view = self._lamp_view(lamp, vectors[k], mesh_ids, X_CG)
-                nearest = np.full(
-                    (SHADOW_MAP_SIZE, SHADOW_MAP_SIZE),
-                    0.0 if view.is_perspective else -np.inf,
-                    np.float32,
-                )
-                hit = np.full(nearest.shape, -1, np.int32)
+                nearest = maps[len(poses)]
+                nearest[:] = 0.0 if view.is_perspective else -np.inf
                 nothing = np.empty((0, NUM_COEFFICIENTS), np.float32)
                 X_LG = _compose(X_LC, X_CG)
+                hit = self._memory("map_hit", (size, size), np.int32)
                 draw(
                     self._arrays, mesh_ids, X_LG, view, nearest, hit, nothing, np.empty(0, np.int64)
                 )
-                shadow_map[k] = len(maps)
-                maps.append(nearest)
+                shadow_map[k] = len(poses)
                 poses.append(X_LC)
                 views.append(view)
         colors = [
@@ -217,10 +214,19 @@ class MeshRenderer:
             np.array(colors, np.float32).reshape(-1, 3),
             np.array([lamp.kind is LampKind.POINT for lamp in lighting.lamps], np.bool_),
             shadow_map,
-            np.array(maps, np.float32).reshape(-1, SHADOW_MAP_SIZE, SHADOW_MAP_SIZE),
+            maps,
             np.array(poses, np.float32).reshape(-1, 3, 4),
             np.array([view[:4] for view in views], np.float32).reshape(-1, 4),
         )
+
+    def _memory(self, name: str, shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
+        """Return memory with undefined content, which is kept.
+
+        New memory for each image would cost more than the image.
+        """
+        if name not in self._scratch or self._scratch[name].shape != shape:
+            self._scratch[name] = np.empty(shape, dtype)
+        return self._scratch[name]
 
     def _lamp_view(
         self, lamp: Lamp, vector: Floats, mesh_ids: NDArray[np.int64], X_CG: Floats
@@ -254,10 +260,12 @@ class MeshRenderer:
         return _invert(X_CL), View(room / tangent, center, center, True, NEAR_DEPTH)
 
 
-def _depth_image(nearest: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return a depth image [m] for inverse depths [1/m]; see `RenderedImages`."""
-    with np.errstate(divide="ignore"):
-        depth = np.float32(1.0) / nearest
-    depth[depth > MAX_DEPTH] = np.inf
-    depth[depth < MIN_SENSOR_DEPTH] = 0.0
-    return depth
+def _resolve_images(
+    drawing: _Drawing, labels: NDArray[np.int64]
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Return depth and label images for the labels of instances (n,); see `RenderedImages`."""
+    depth = np.empty(drawing.hit.shape, np.float32)
+    label = np.empty(drawing.hit.shape, np.int64)
+    limits = np.float32(MIN_SENSOR_DEPTH), np.float32(MAX_DEPTH)
+    resolve(drawing.nearest, drawing.hit, drawing.owner, labels, limits, depth, label)
+    return depth, label

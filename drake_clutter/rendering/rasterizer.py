@@ -46,7 +46,8 @@ class MeshArrays(NamedTuple):
         uv: Position in the texture; integers are centers of its pixels [px]. Shape (V, 2).
         triangles: Vertex indices. Shape (F, 3).
         first_triangle: Index of the first triangle of each mesh, and of the end. Shape (m + 1,).
-        texels: Pixels of all textures. Shape (t,), uint8.
+        texels: Pixels of all textures: red in the lowest 8 bits, then green, then blue. Shape (t,),
+            uint32.
         texture: Start in `texels`, width and height of each texture, and whether it repeats. Shape
             (m, 4).
         color: Linear factor on the texture of each mesh. Shape (m, 3), float32.
@@ -58,7 +59,7 @@ class MeshArrays(NamedTuple):
     uv: NDArray[np.float64]
     triangles: NDArray[np.int64]
     first_triangle: NDArray[np.int64]
-    texels: NDArray[np.uint8]
+    texels: NDArray[np.uint32]
     texture: NDArray[np.int64]
     color: NDArray[np.float32]
     roughness: NDArray[np.float32]
@@ -69,14 +70,15 @@ def pack_meshes(meshes: Sequence[VisualMesh]) -> MeshArrays:
     first_vertex = np.cumsum([0] + [len(mesh.points) for mesh in meshes])
     first_triangle = np.cumsum([0] + [len(mesh.triangles) for mesh in meshes])
     starts = dict[int, int]()
-    texels = list[NDArray[np.uint8]]()
+    texels = list[NDArray[np.uint32]]()
     texture = list[tuple[int, ...]]()
     size = 0
     for mesh in meshes:
         if id(mesh.texture) not in starts:
             starts[id(mesh.texture)] = size
-            texels.append(mesh.texture.reshape(-1))
-            size += mesh.texture.size
+            channels = mesh.texture.reshape(-1, 3).astype(np.uint32)
+            texels.append(channels[:, 0] | channels[:, 1] << 8 | channels[:, 2] << 16)
+            size += len(channels)
         height, width, _ = mesh.texture.shape
         repeats = mesh.uv.min(initial=0.0) < 0.0 or mesh.uv.max(initial=1.0) > 1.0
         texture.append((starts[id(mesh.texture)], width, height, int(repeats)))
@@ -93,7 +95,7 @@ def pack_meshes(meshes: Sequence[VisualMesh]) -> MeshArrays:
         stack(uv, np.float64),
         stack(triangles, np.int64),
         first_triangle,
-        stack(texels, np.uint8),
+        stack(texels, np.uint32),
         texture_array,
         np.array([mesh.color for mesh in meshes], np.float32),
         np.array([mesh.roughness for mesh in meshes], np.float32),
@@ -282,3 +284,28 @@ def draw(meshes, mesh_ids, X_VG, view, nearest, hit, surfaces, owner):  # type: 
                 owner[count] = i
                 count += 1
     return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def resolve(nearest, hit, owner, labels, limits, depth, label):  # type: ignore[no-untyped-def]
+    """Write depth and labels of what was drawn.
+
+    Args:
+        nearest: Nearness of a perspective view, 0 where there is nothing. Shape (height, width).
+        hit: Triangle in each pixel, -1 where there is none. Shape (height, width).
+        owner: Instance of each triangle. Shape (t,).
+        labels: Label of each instance. Shape (n,).
+        limits: Depths below which the image holds 0, and above which it is infinite [m].
+        depth: Output: depth; infinite where there is nothing [m]. Shape (height, width).
+        label: Output: label; -1 where there is nothing. Shape (height, width).
+    """
+    lowest, highest = limits
+    one, zero, nothing = np.float32(1.0), np.float32(0.0), np.float32(np.inf)
+    for row in range(hit.shape[0]):
+        for column in range(hit.shape[1]):
+            value = one / nearest[row, column]
+            value = zero if value < lowest else value
+            depth[row, column] = nothing if value > highest else value
+        for column in range(hit.shape[1]):
+            triangle = hit[row, column]
+            label[row, column] = labels[owner[triangle]] if triangle >= 0 else -1

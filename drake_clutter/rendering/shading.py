@@ -91,116 +91,145 @@ def _wrap(index, size, repeats):  # type: ignore[no-untyped-def]
     return min(max(index, 0), size - 1)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _sample_texture(texels, texture, decode, s, t):  # type: ignore[no-untyped-def]
-    """Return the linear color at a position (s, t) [px], interpolated between four pixels."""
-    first, width, height, repeats = texture[0], texture[1], texture[2], texture[3] != 0
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _decode(texel, decode):  # type: ignore[no-untyped-def]
+    """Return the linear color of a pixel of a texture, see `MeshArrays.texels`."""
+    return (
+        decode[texel & np.uint32(255)],
+        decode[(texel >> np.uint32(8)) & np.uint32(255)],
+        decode[(texel >> np.uint32(16)) & np.uint32(255)],
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _sample_texture(texels, first, width, height, repeats, decode, s, t):  # type: ignore[no-untyped-def]
+    """Return the linear color at a position (s, t) [px], interpolated between four pixels.
+
+    Args:
+        texels: Pixels of all textures. Shape (n,).
+        first: Start of the texture in it.
+        width: Width of the texture [px].
+        height: Height of the texture [px].
+        repeats: Whether the texture repeats beyond its edges.
+        decode: Linear values of sRGB values. Shape (256,).
+        s: Column.
+        t: Row.
+    """
     if width == 1 and height == 1:
-        return decode[texels[first]], decode[texels[first + 1]], decode[texels[first + 2]]
+        return _decode(texels[first], decode)
     left, top = np.floor(s), np.floor(t)
     fs, ft = np.float32(s - left), np.float32(t - top)
     column, row = np.int64(left), np.int64(top)
     c0, c1 = _wrap(column, width, repeats), _wrap(column + 1, width, repeats)
-    r0, r1 = _wrap(row, height, repeats), _wrap(row + 1, height, repeats)
-    i00, i01 = first + 3 * (r0 * width + c0), first + 3 * (r0 * width + c1)
-    i10, i11 = first + 3 * (r1 * width + c0), first + 3 * (r1 * width + c1)
+    r0 = first + _wrap(row, height, repeats) * width
+    r1 = first + _wrap(row + 1, height, repeats) * width
     w00, w01 = (_ONE - fs) * (_ONE - ft), fs * (_ONE - ft)
     w10, w11 = (_ONE - fs) * ft, fs * ft
-    red = (
-        w00 * decode[texels[i00]]
-        + w01 * decode[texels[i01]]
-        + w10 * decode[texels[i10]]
-        + w11 * decode[texels[i11]]
+    # Unsigned indices need no check for negative values.
+    red00, green00, blue00 = _decode(texels[np.uint64(r0 + c0)], decode)
+    red01, green01, blue01 = _decode(texels[np.uint64(r0 + c1)], decode)
+    red10, green10, blue10 = _decode(texels[np.uint64(r1 + c0)], decode)
+    red11, green11, blue11 = _decode(texels[np.uint64(r1 + c1)], decode)
+    return (
+        w00 * red00 + w01 * red01 + w10 * red10 + w11 * red11,
+        w00 * green00 + w01 * green01 + w10 * green10 + w11 * green11,
+        w00 * blue00 + w01 * blue01 + w10 * blue10 + w11 * blue11,
     )
-    green = (
-        w00 * decode[texels[i00 + 1]]
-        + w01 * decode[texels[i01 + 1]]
-        + w10 * decode[texels[i10 + 1]]
-        + w11 * decode[texels[i11 + 1]]
-    )
-    blue = (
-        w00 * decode[texels[i00 + 2]]
-        + w01 * decode[texels[i01 + 2]]
-        + w10 * decode[texels[i10 + 2]]
-        + w11 * decode[texels[i11 + 2]]
-    )
-    return red, green, blue
+
+
+# In the loops over pixels, arrays are indexed directly: numba counts references of slices.
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _lit_fraction(shadow, X, view, x, y, z, nx, ny, nz):  # type: ignore[no-untyped-def]
-    """Return the fraction of a lamp's light that reaches a point, from its shadow map.
+def _add_shadows(buffer, count, shadow, X_LC, projection):  # type: ignore[no-untyped-def]
+    """Multiply the irradiance by the fraction of a lamp's light that reaches each pixel.
 
     Args:
-        shadow: The shadow map. Shape (size, size).
-        X: Pose X_LC. Shape (3, 4).
-        view: Scale, u0, v0 and whether the view is perspective. Shape (4,).
-        x: Point in C [m].
-        y: Point in C [m].
-        z: Point in C [m].
-        nx: Unit normal in C.
-        ny: Unit normal in C.
-        nz: Unit normal in C.
+        buffer: The buffer.
+        count: Number of pixels in it.
+        shadow: Nearness of what the lamp sees. Shape (size, size).
+        X_LC: Pose of the camera in the view frame of the lamp [m]. Shape (3, 4).
+        projection: Scale, u0, v0 and whether the view is perspective. Shape (4,).
     """
-    scale = view[0]
-    is_perspective = view[3] != _ZERO
-    depth = X[2, 0] * x + X[2, 1] * y + X[2, 2] * z + X[2, 3]
-    offset = np.float32(SHADOW_OFFSET) / scale
-    if is_perspective:
-        if depth <= _ZERO:
-            return _ONE
-        offset = offset * depth
-    x, y, z = x + offset * nx, y + offset * ny, z + offset * nz
-    p_x = X[0, 0] * x + X[0, 1] * y + X[0, 2] * z + X[0, 3]
-    p_y = X[1, 0] * x + X[1, 1] * y + X[1, 2] * z + X[1, 3]
-    depth = X[2, 0] * x + X[2, 1] * y + X[2, 2] * z + X[2, 3]
-    nearness = -depth
-    if is_perspective:
-        if depth <= _ZERO:
-            return _ONE
-        nearness = _ONE / depth
-        scale = scale / depth
-    u, v = view[1] + scale * p_x, view[2] + scale * p_y
-    size = shadow.shape[0]
-    if not (u >= _ZERO and v >= _ZERO and u < np.float32(size - 1) and v < np.float32(size - 1)):
-        return _ONE
-    column, row = np.int64(u), np.int64(v)
-    fu, fv = u - np.float32(column), v - np.float32(row)
-    lit = _ZERO
-    if shadow[row, column] <= nearness:
-        lit += (_ONE - fu) * (_ONE - fv)
-    if shadow[row, column + 1] <= nearness:
-        lit += fu * (_ONE - fv)
-    if shadow[row + 1, column] <= nearness:
-        lit += (_ONE - fu) * fv
-    if shadow[row + 1, column + 1] <= nearness:
-        lit += fu * fv
-    return lit
+    r00, r01, r02, p0 = X_LC[0, 0], X_LC[0, 1], X_LC[0, 2], X_LC[0, 3]
+    r10, r11, r12, p1 = X_LC[1, 0], X_LC[1, 1], X_LC[1, 2], X_LC[1, 3]
+    r20, r21, r22, p2 = X_LC[2, 0], X_LC[2, 1], X_LC[2, 2], X_LC[2, 3]
+    scale, u0, v0 = projection[0], projection[1], projection[2]
+    is_perspective = projection[3] != _ZERO
+    last = shadow.shape[0] - 1
+    end = np.float32(last)
+    for i in range(count):
+        nx, ny, nz = buffer[_NX + i], buffer[_NY + i], buffer[_NZ + i]
+        if nx * buffer[_LX + i] + ny * buffer[_LY + i] + nz * buffer[_LZ + i] <= _ZERO:
+            continue
+        # The direction of the camera has z = -1 / length.
+        distance = buffer[_Z + i] / buffer[_VZ + i]
+        x, y, z = distance * buffer[_VX + i], distance * buffer[_VY + i], buffer[_Z + i]
+        offset = np.float32(SHADOW_OFFSET) / scale
+        if is_perspective:
+            offset = offset * max(r20 * x + r21 * y + r22 * z + p2, _ZERO)
+        x, y, z = x + offset * nx, y + offset * ny, z + offset * nz
+        px = r00 * x + r01 * y + r02 * z + p0
+        py = r10 * x + r11 * y + r12 * z + p1
+        depth = r20 * x + r21 * y + r22 * z + p2
+        size, nearness = scale, -depth
+        if is_perspective:
+            if depth <= _ZERO:
+                continue
+            nearness = _ONE / depth
+            size = scale / depth
+        u, v = u0 + size * px, v0 + size * py
+        if not (u >= _ZERO and v >= _ZERO and u < end and v < end):
+            continue
+        column, row = np.int64(u), np.int64(v)
+        fu, fv = u - np.float32(column), v - np.float32(row)
+        lit = _ZERO
+        if shadow[row, column] <= nearness:
+            lit += (_ONE - fu) * (_ONE - fv)
+        if shadow[row, column + 1] <= nearness:
+            lit += fu * (_ONE - fv)
+        if shadow[row + 1, column] <= nearness:
+            lit += (_ONE - fu) * fv
+        if shadow[row + 1, column + 1] <= nearness:
+            lit += fu * fv
+        buffer[_E + i] *= lit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _gather(buffer, count, row, meshes, mesh_ids, hit, surfaces, owner, decode, view):  # type: ignore[no-untyped-def]
     """Fill the buffer with normal, direction of the camera, depth and material of each pixel."""
+    texels, texture, color = meshes.texels, meshes.texture, meshes.color
+    roughnesses = meshes.roughness
+    scale, u0, v0 = np.float32(view.scale), np.float32(view.u0), np.float32(view.v0)
     v = np.float32(row)
     for i in range(count):
-        u = np.float32(buffer[_COLUMN + i])
-        triangle = hit[row, np.int64(buffer[_COLUMN + i])]
-        a = surfaces[triangle]
-        du, dv = u - a[0], v - a[1]
-        z = _ONE / (a[2] * du + a[3] * dv + a[4])
+        u = buffer[_COLUMN + i]
+        k = np.uint64(hit[row, np.uint64(u)])
+        du, dv = u - surfaces[k, 0], v - surfaces[k, 1]
+        z = _ONE / (surfaces[k, 2] * du + surfaces[k, 3] * dv + surfaces[k, 4])
         buffer[_Z + i] = z
-        buffer[_VX + i] = (np.float32(view.u0) - u) / np.float32(view.scale)
-        buffer[_VY + i] = (np.float32(view.v0) - v) / np.float32(view.scale)
-        buffer[_NX + i] = a[5] * du + a[6] * dv + a[7]
-        buffer[_NY + i] = a[8] * du + a[9] * dv + a[10]
-        buffer[_NZ + i] = a[11] * du + a[12] * dv + a[13]
-        s, t = (a[14] * du + a[15] * dv + a[16]) * z, (a[17] * du + a[18] * dv + a[19]) * z
-        mesh = mesh_ids[owner[triangle]]
-        red, green, blue = _sample_texture(meshes.texels, meshes.texture[mesh], decode, s, t)
-        buffer[_AR + i] = red * meshes.color[mesh, 0]
-        buffer[_AG + i] = green * meshes.color[mesh, 1]
-        buffer[_AB + i] = blue * meshes.color[mesh, 2]
-        roughness = meshes.roughness[mesh]
+        buffer[_VX + i] = (u0 - u) / scale
+        buffer[_VY + i] = (v0 - v) / scale
+        buffer[_NX + i] = surfaces[k, 5] * du + surfaces[k, 6] * dv + surfaces[k, 7]
+        buffer[_NY + i] = surfaces[k, 8] * du + surfaces[k, 9] * dv + surfaces[k, 10]
+        buffer[_NZ + i] = surfaces[k, 11] * du + surfaces[k, 12] * dv + surfaces[k, 13]
+        s = (surfaces[k, 14] * du + surfaces[k, 15] * dv + surfaces[k, 16]) * z
+        t = (surfaces[k, 17] * du + surfaces[k, 18] * dv + surfaces[k, 19]) * z
+        mesh = mesh_ids[owner[k]]
+        red, green, blue = _sample_texture(
+            texels,
+            texture[mesh, 0],
+            texture[mesh, 1],
+            texture[mesh, 2],
+            texture[mesh, 3] != 0,
+            decode,
+            s,
+            t,
+        )
+        buffer[_AR + i] = red * color[mesh, 0]
+        buffer[_AG + i] = green * color[mesh, 1]
+        buffer[_AB + i] = blue * color[mesh, 2]
+        roughness = roughnesses[mesh]
         buffer[_A2 + i] = roughness * roughness * roughness * roughness
 
 
@@ -232,24 +261,25 @@ def _prepare(buffer, ambient):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, error_model="numpy")
 def _aim_lamp(buffer, x, y, z, is_point):  # type: ignore[no-untyped-def]
     """Fill the buffer with the direction of a lamp, and its irradiance relative to that at 1 m."""
-    for i in range(_BLOCK):
-        if is_point:
-            # The direction of the camera has z = -1 / length.
-            depth = -buffer[_Z + i] / buffer[_VZ + i]
-            lx = x + depth * buffer[_VX + i]
-            ly = y + depth * buffer[_VY + i]
-            lz = z + depth * buffer[_VZ + i]
-            square = lx * lx + ly * ly + lz * lz
-            length = np.sqrt(square)
-            buffer[_LX + i] = lx / length
-            buffer[_LY + i] = ly / length
-            buffer[_LZ + i] = lz / length
-            buffer[_E + i] = _ONE / square
-        else:
+    if not is_point:
+        for i in range(_BLOCK):
             buffer[_LX + i] = x
             buffer[_LY + i] = y
             buffer[_LZ + i] = z
             buffer[_E + i] = _ONE
+        return
+    for i in range(_BLOCK):
+        # The direction of the camera has z = -1 / length.
+        depth = -buffer[_Z + i] / buffer[_VZ + i]
+        lx = x + depth * buffer[_VX + i]
+        ly = y + depth * buffer[_VY + i]
+        lz = z + depth * buffer[_VZ + i]
+        square = lx * lx + ly * ly + lz * lz
+        length = np.sqrt(square)
+        buffer[_LX + i] = lx / length
+        buffer[_LY + i] = ly / length
+        buffer[_LZ + i] = lz / length
+        buffer[_E + i] = _ONE / square
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -294,27 +324,12 @@ def _shade_block(buffer, count, lamps, ambient):  # type: ignore[no-untyped-def]
         _aim_lamp(buffer, x, y, z, lamps.is_point[lamp])
         k = lamps.shadow_map[lamp]
         if k >= 0:
-            for i in range(count):
-                nx, ny, nz = buffer[_NX + i], buffer[_NY + i], buffer[_NZ + i]
-                lx, ly, lz = buffer[_LX + i], buffer[_LY + i], buffer[_LZ + i]
-                if nx * lx + ny * ly + nz * lz > _ZERO:
-                    distance = -buffer[_Z + i] / buffer[_VZ + i]
-                    buffer[_E + i] *= _lit_fraction(
-                        lamps.maps[k],
-                        lamps.X_LC[k],
-                        lamps.projection[k],
-                        -distance * buffer[_VX + i],
-                        -distance * buffer[_VY + i],
-                        buffer[_Z + i],
-                        nx,
-                        ny,
-                        nz,
-                    )
+            _add_shadows(buffer, count, lamps.maps[k], lamps.X_LC[k], lamps.projection[k])
         _add_lamp(buffer, lamps.color[lamp, 0], lamps.color[lamp, 1], lamps.color[lamp, 2])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def shade(meshes, mesh_ids, view, hit, surfaces, owner, lamps, ambient, tables, color):  # type: ignore[no-untyped-def]
+def shade(meshes, mesh_ids, view, hit, surfaces, owner, lamps, ambient, tables, background, color):  # type: ignore[no-untyped-def]
     """Write the colors of what was drawn.
 
     Args:
@@ -327,24 +342,30 @@ def shade(meshes, mesh_ids, view, hit, surfaces, owner, lamps, ambient, tables, 
         lamps: `LampArrays`.
         ambient: Radiance of a white surface without lamps, times the exposure.
         tables: Tables of `make_decoding_table` and `make_encoding_table`.
-        color: Output, to be initialized with the background. Shape (height, width, 3).
+        background: Color where there is no triangle. Shape (3,).
+        color: Output. Shape (height, width, 3).
     """
     decode, encode = tables
     buffer = np.ones(_BUFFER, np.float32)
     height, width = hit.shape
-    full, one = np.float32(_LEVELS), np.float32(1.0)
+    full = np.float32(_LEVELS)
+    red, green, blue = background
     for row in range(height):
         count = 0
         for column in range(width):
             if hit[row, column] >= 0:
                 buffer[_COLUMN + count] = np.float32(column)
                 count += 1
+            else:
+                color[row, column, 0] = red
+                color[row, column, 1] = green
+                color[row, column, 2] = blue
             if count == _BLOCK or (count and column == width - 1):
                 _gather(buffer, count, row, meshes, mesh_ids, hit, surfaces, owner, decode, view)
                 _shade_block(buffer, count, lamps, np.float32(ambient))
                 for i in range(count):
-                    here = color[row, np.int64(buffer[_COLUMN + i])]
-                    here[0] = encode[np.int64(min(buffer[_R + i], one) * full + _HALF)]
-                    here[1] = encode[np.int64(min(buffer[_G + i], one) * full + _HALF)]
-                    here[2] = encode[np.int64(min(buffer[_B + i], one) * full + _HALF)]
+                    k = np.int64(buffer[_COLUMN + i])
+                    color[row, k, 0] = encode[np.int64(min(buffer[_R + i], _ONE) * full + _HALF)]
+                    color[row, k, 1] = encode[np.int64(min(buffer[_G + i], _ONE) * full + _HALF)]
+                    color[row, k, 2] = encode[np.int64(min(buffer[_B + i], _ONE) * full + _HALF)]
                 count = 0
