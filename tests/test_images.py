@@ -26,6 +26,7 @@ from drake_clutter.perception.image_dataset import (
     encode_run_lengths,
     write_images,
 )
+from drake_clutter.rendering.lighting import LampKind
 from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.simulation.camera_renderer import CameraRenderer
 from drake_clutter.simulation.drop import sample_drop_scene, simulate_drop
@@ -324,6 +325,62 @@ def test_the_same_seed_generates_the_same_dataset(
     )
     with pytest.raises(InputError, match="results of other options"):
         script.main(tmp_path / "one", count=2, heap_fraction=0.0, seed=4, objects="ycb7")
+
+
+def test_images_of_the_compiled_renderer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The camera moves from item to item, and the poses are given for where it was."""
+    script = training_script("render_image_dataset")
+    monkeypatch.setattr(script, "GENERATED_IMAGES", 2)
+    monkeypatch.setattr(script, "NODES", 10)
+    monkeypatch.setattr(script, "GENERATORS", {"random": ""})
+    options = {"heap_fraction": 0.0, "seed": 3, "objects": "ycb7"}
+    options["renderer"] = script.RendererKind.RASTER
+    script.main(tmp_path / "one", count=4, **options)
+    script.main(tmp_path / "other", count=2, **options)
+    first_item = tmp_path / "other" / TRAIN_FOLDER / "000000"
+    files = [path.relative_to(tmp_path / "other") for path in first_item.rglob("*.*")]
+    assert len(files) > 10
+    for file in files:
+        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "other" / file).read_bytes()
+    options["renderer"] = script.RendererKind.VTK
+    with pytest.raises(InputError, match="results of other options"):
+        script.main(tmp_path / "one", count=4, **options)
+    positions = set()
+    checked = 0
+    for item in ("000000", "000001"):
+        folder = tmp_path / "one" / TRAIN_FOLDER / item
+        cameras = json.loads((folder / "scene_camera.json").read_text())
+        positions.add(tuple(cameras["0"]["cam_t_w2c"]))
+        R_CT = np.reshape(cameras["0"]["cam_R_w2c"], (3, 3))
+        assert np.degrees(np.arccos(R_CT[2, 2] * -1)) < 1.5  # still looks down
+        for key, instances in json.loads((folder / "scene_gt.json").read_text()).items():
+            K = np.reshape(cameras[key]["cam_K"], (3, 3))
+            for k, instance in enumerate(instances):
+                # The centers of boxes and cylinders lie in their silhouettes.
+                u, v, w = K @ instance["cam_t_m2c"]
+                path = folder / "mask" / f"{int(key):06d}_{k:06d}.png"
+                assert np.asarray(Image.open(path))[round(v / w), round(u / w)] == 255
+                checked += 1
+    assert len(positions) == 2
+    assert checked >= 8
+
+
+def test_lamps_of_a_room() -> None:
+    """A tray that faces each lamp gets 1.5 to 4 in all, divided by the cosine at most."""
+    script = training_script("render_image_dataset")
+    for seed in range(50):
+        lighting = script.sample_room_lighting(rng(seed))
+        assert 1 <= len(lighting.lamps) <= 3
+        assert all(lamp.casts_shadows and not lamp.is_on_camera for lamp in lighting.lamps)
+        irradiances = [
+            lamp.intensity
+            / (np.dot(lamp.vector, lamp.vector) if lamp.kind is LampKind.POINT else 1)
+            for lamp in lighting.lamps
+        ]
+        assert 1.5 <= sum(irradiances) <= 4.0
+        # All are above the tray: points at a positive height, directions downwards.
+        assert all((lamp.vector[2] > 0) is (lamp.kind is LampKind.POINT) for lamp in lighting.lamps)
+        assert lighting == script.sample_room_lighting(rng(seed))
 
 
 def test_a_mirrored_pose_is_refused(tmp_path: Path, images: list[AnnotatedImage]) -> None:

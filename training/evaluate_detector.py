@@ -29,10 +29,15 @@ from drake_clutter.perception.image_dataset import ImageDataset, LabeledImage
 from drake_clutter.perception.learned_detector import LearnedDetector
 from drake_clutter.perception.pose_fit import pose_error
 from drake_clutter.perception.segmentation import SegmentationNetwork
+from drake_clutter.rendering.lighting import CAMERA_LIGHTING
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.seeding import item_rng
-from drake_clutter.simulation.camera_renderer import CameraRenderer
+from drake_clutter.simulation.image_renderer import (
+    ImageRenderer,
+    RendererKind,
+    make_image_renderer,
+)
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.validation import to_plain
 from training.results_file import provenance
@@ -162,24 +167,16 @@ def mask_iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
     return int(np.count_nonzero(a & b)) / max(1, int(np.count_nonzero(a | b)))
 
 
-def render_image(renderer: CameraRenderer, scene: Scene) -> LabeledImage:
+def render_image(renderer: ImageRenderer, scene: Scene) -> LabeledImage:
     """Return an image of a scene with its ground truth."""
     images = renderer.render(scene)
-    visible_fractions = renderer.visible_fractions(scene, images.label)
-    num_pixels = np.bincount(images.label.ravel() + 1, minlength=len(scene.objects) + 1)[1:]
-    unoccluded_pixels = np.array(
-        [
-            round(n / visible_fractions[o.name]) if visible_fractions[o.name] > 0 else 1
-            for n, o in zip(num_pixels, scene.objects, strict=True)
-        ]
-    )
     return LabeledImage(
         images.color,
         images.depth,
         images.label,
         tuple(o.object_class.name for o in scene.objects),
         tuple(o.X_TO for o in scene.objects),
-        unoccluded_pixels,
+        np.count_nonzero(renderer.silhouettes(scene), axis=(1, 2)),
     )
 
 
@@ -234,6 +231,9 @@ def main(
     ] = None,
     seed: SeedOption = 0,
     catalog: CatalogOption = None,
+    renderer: Annotated[
+        RendererKind, typer.Option(help="Renderer of the images of the scenes.")
+    ] = RendererKind.VTK,
     threads: Annotated[int, typer.Option(min=1, help="Threads of PyTorch.")] = 2,
 ) -> None:
     """Evaluate a detector, and print and write its metrics."""
@@ -241,7 +241,7 @@ def main(
     config = ClutterConfig()
     all_classes = load_catalog(catalog)
     network = SegmentationNetwork.load(detector)
-    camera = CameraRenderer(config.cell.camera)
+    camera = make_image_renderer(renderer, config.cell.camera, CAMERA_LIGHTING)
     rows = dict[str, Any]()
     for path in scenes:
         dataset = load_scene_dataset(path, all_classes)
@@ -264,6 +264,7 @@ def main(
             **provenance(),
             "seed": seed,
             "count": count,
+            "renderer": renderer.value,
             "rows": rows,
             "config": to_plain(config),
         },

@@ -11,9 +11,13 @@ its own (see `drake_clutter.perception.image_dataset`). It is one of
                classes, laid out but not settled; objects are removed from the top, and some of
                them are placed elsewhere on the tray
 
-Randomized per item: two to four lights (direction, intensity, color temperature). Randomized per
-image: the colors of each instance and of the tray, and the background beyond it. The camera does
-not move.
+Randomized per image: the colors of each instance and of the tray, and the background beyond it.
+Randomized per item, by the renderer:
+
+    vtk     two to four lamps beside the camera (direction, intensity, color temperature); the
+            camera does not move
+    raster  one to three lamps of a room that cast shadows, ambient light, exposure, and the pose of
+            the camera about that of the work cell
 
 The dataset has the layout of BOP: the BOP toolkit reads it as split `train`. An interrupted run is
 resumed by the same command; a larger count extends the dataset. The scenes depend on --seed
@@ -31,11 +35,12 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 from PIL import Image
-from pydrake.geometry import LightParameter, RenderEngineVtkParams, Rgba
 from scipy.spatial.transform import Rotation
 
 from drake_clutter.agents.generators import GenerationJob, SceneGenerator
 from drake_clutter.catalog import load_catalog
+from drake_clutter.cell.camera import Camera
+from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.commands.job_file import open_job_folder
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.bop_models import (
@@ -48,14 +53,16 @@ from drake_clutter.perception.image_dataset import (
     LabeledImage,
     write_images,
 )
+from drake_clutter.rendering.lighting import Lamp, LampKind, Lighting
 from drake_clutter.rendering.mesh_renderer import RenderedImages
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.seeding import item_rng
-from drake_clutter.simulation.camera_renderer import (
-    RENDER_ENGINE_PARAMS,
-    CameraRenderer,
-)
 from drake_clutter.simulation.drop import sample_drop_scene, simulate_drop
+from drake_clutter.simulation.image_renderer import (
+    ImageRenderer,
+    RendererKind,
+    make_image_renderer,
+)
 from drake_clutter.validation import to_plain
 from drake_clutter.workers.parallel_map import map_ordered
 from training.script import CatalogOption, SeedOption, WorkersOption, progress, run_script
@@ -74,6 +81,14 @@ GENERATORS = {"random": "", "sg-star": "ycb7", "sg-14": "pantry14"}
 """Scene generators by name, and the object set that each was trained with; "" for any."""
 MOVE_PROBABILITY = 0.5
 """Probability that an object removed from a generated scene is placed elsewhere."""
+MAX_LAMP_DISTANCE = 1.5
+"""Largest distance of a room's lamp from the tray along x and y [m]."""
+LAMP_HEIGHTS = (1.7, 2.8)
+"""Smallest and largest height of a room's lamp above the tray [m]."""
+POSITION_SPREAD = 0.003
+"""Standard deviation of each coordinate of the camera's position [m]; assumed."""
+ROTATION_SPREAD_DEG = 0.2
+"""Standard deviation of each angle of the camera's rotation [deg]; assumed."""
 _PLACEMENT_TRIES = 50
 _PLACEMENT_GAP = 0.005
 """Distance to other objects, seen from above, that a placement keeps [m]."""
@@ -88,12 +103,14 @@ class ImageJob:
         catalog: Asset folder with additional object classes, or None.
         heap_fraction: Fraction of the images that show heaps.
         seed: Seed of the dataset.
+        renderer: Renderer of the images.
     """
 
     objects: str
     catalog: Path | None
     heap_fraction: float
     seed: int
+    renderer: RendererKind = RendererKind.VTK
 
     def is_heap(self, item: int) -> bool:
         """Return whether an item is a heap.
@@ -142,18 +159,22 @@ class ItemRenderer:
         count = self._job.num_images(item)
         is_heap = self._job.is_heap(item)
         scenes = self._heaps(count, rng) if is_heap else self._generated_scenes(count, rng)
-        camera = CameraRenderer(self._config.cell.camera, sample_lights(rng))
+        camera, lighting = self._config.cell.camera, sample_lights(rng)
+        if self._job.renderer is RendererKind.RASTER:
+            camera, lighting = sample_camera(camera, rng), sample_room_lighting(rng)
+        renderer = make_image_renderer(self._job.renderer, camera, lighting)
         silhouettes = dict[SceneObject, NDArray[np.bool_]]()
-        images = (render_image(camera, scene, silhouettes, rng) for scene in scenes)
+        images = (render_image(renderer, scene, silhouettes, rng) for scene in scenes)
         write_images(
             self._out / TRAIN_FOLDER / f"{item:06d}",
             images,
-            self._config.cell.camera,
+            camera,
             list(load_catalog(self._job.catalog).classes),
         )
-        # The process can abort when another thread collects the renderer.
-        del camera
-        gc.collect()
+        if self._job.renderer is RendererKind.VTK:
+            # The process can abort when another thread collects the renderer.
+            del renderer, images
+            gc.collect()
 
     def _heaps(self, count: int, rng: np.random.Generator) -> Iterator[Scene]:
         """Yield a heap with fewer and fewer objects, down to one, at random times of the drop."""
@@ -247,29 +268,60 @@ def _overlap(one: SceneObject, other: SceneObject, gap: float) -> bool:
     return bool((np.minimum(upper, other_upper) > np.maximum(lower, other_lower) - gap)[:2].all())
 
 
-def sample_lights(rng: np.random.Generator) -> RenderEngineVtkParams:
-    """Return a render engine with two to four random lights beside the camera."""
+def sample_lights(rng: np.random.Generator) -> Lighting:
+    """Return two to four random directional lamps beside the camera, without shadows."""
     count = rng.integers(2, 5)
     intensities = rng.dirichlet(np.full(count, 2.0)) * rng.uniform(2.0, 4.5)
-    lights = []
-    for intensity in intensities:
-        x, y = rng.uniform(-0.9, 0.9, 2)
+    lamps = []
+    for intensity in intensities.tolist():
+        x, y = rng.uniform(-0.9, 0.9, 2).tolist()
         warmth = rng.uniform(-0.12, 0.12)
-        color = Rgba(min(1.0, 1 + warmth), 1 - abs(warmth) / 2, min(1.0, 1 - warmth))
-        lights.append(
-            LightParameter(
-                type="directional",
-                direction=[x, y, 1.0],
-                frame="camera",
-                intensity=intensity,
-                color=color,
+        color = min(1.0, 1 + warmth), 1 - abs(warmth) / 2, min(1.0, 1 - warmth)
+        lamps.append(Lamp(LampKind.DIRECTIONAL, (x, y, 1.0), intensity, color, is_on_camera=True))
+    return Lighting(tuple(lamps))
+
+
+def sample_room_lighting(rng: np.random.Generator) -> Lighting:
+    """Return one to three random lamps of a room with shadows, ambient light and an exposure.
+
+    Point lamps hang beside the camera or above it, and directional ones are windows.
+    """
+    count = int(rng.integers(1, 4))
+    irradiances = rng.dirichlet(np.full(count, 2.0)) * rng.uniform(1.5, 4.0)
+    lamps = []
+    for irradiance in irradiances.tolist():
+        x, y = rng.uniform(-MAX_LAMP_DISTANCE, MAX_LAMP_DISTANCE, 2).tolist()
+        height = float(rng.uniform(*LAMP_HEIGHTS))
+        warmth = float(rng.uniform(-0.12, 0.12))
+        color = min(1.0, 1 + warmth), 1 - abs(warmth) / 2, min(1.0, 1 - warmth)
+        squared_distance = x**2 + y**2 + height**2
+        if rng.random() < 0.5:
+            lamp = Lamp(
+                LampKind.POINT,
+                (x, y, height),
+                irradiance * squared_distance,
+                color,
+                casts_shadows=True,
             )
-        )
-    return RenderEngineVtkParams(backend=RENDER_ENGINE_PARAMS.backend, lights=lights)
+        else:
+            lamp = Lamp(
+                LampKind.DIRECTIONAL, (-x, -y, -height), irradiance, color, casts_shadows=True
+            )
+        lamps.append(lamp)
+    ambient = float(rng.uniform(0.05, 0.4))
+    return Lighting(tuple(lamps), ambient=ambient, exposure=float(rng.uniform(0.7, 1.3)))
+
+
+def sample_camera(camera: Camera, rng: np.random.Generator) -> Camera:
+    """Return a camera whose pose differs by what a calibration leaves."""
+    translation = np.array(camera.pose.translation) + rng.normal(0.0, POSITION_SPREAD, 3)
+    rpy_deg = np.array(camera.pose.rpy_deg) + rng.normal(0.0, ROTATION_SPREAD_DEG, 3)
+    pose = PoseSpec(translation=tuple(translation.tolist()), rpy_deg=tuple(rpy_deg.tolist()))
+    return camera.model_copy(update={"pose": pose})
 
 
 def render_image(
-    camera: CameraRenderer,
+    camera: ImageRenderer,
     scene: Scene,
     silhouettes: dict[SceneObject, NDArray[np.bool_]],
     rng: np.random.Generator,
@@ -277,7 +329,7 @@ def render_image(
     """Return an image of a scene in random colors, with its ground truth.
 
     Args:
-        camera: The camera.
+        camera: Renderer of the camera's images.
         scene: The scene.
         silhouettes: Pixels that an object covers when nothing occludes it. Objects that are not in
             it are added. Shape (H, W) each.
@@ -353,9 +405,13 @@ def main(
     workers: WorkersOption = 1,
     objects: Annotated[str, typer.Option(help="Name of the object set.")] = "pantry14",
     catalog: CatalogOption = None,
+    renderer: Annotated[
+        RendererKind, typer.Option(help="Renderer; each has its own lamps, see the script.")
+    ] = RendererKind.VTK,
 ) -> None:
     """Render a dataset of labeled images."""
-    job = ImageJob(objects, catalog.resolve() if catalog else None, heap_fraction, seed)
+    folder = catalog.resolve() if catalog else None
+    job = ImageJob(objects, folder, heap_fraction, seed, renderer)
     job_fields = {**to_plain(job), "agents": [agent for agent, _ in job.generators()]}
     with open_job_folder(out, job_fields):
         write_dataset_camera(out, ClutterConfig().cell.camera)

@@ -130,7 +130,8 @@ def _read_job(path: Path) -> dict[str, Any]:
         written = validate(dict[str, Any], read_json(path, content), source)
         job = {_RENAMED_FIELDS.get(key, key): value for key, value in written.items()}
         if "heap_fraction" in job:
-            job = {"catalog": None} | job  # Version 0.1 rendered shipped objects alone.
+            # Version 0.1 rendered shipped objects alone, with VTK.
+            job = {"catalog": None, "renderer": "vtk"} | job
         if "config" in job:
             config = upgrade_header_configs(job["config"])
             job["config"] = to_plain(validate(ClutterConfig, config, f"{source}: config"))

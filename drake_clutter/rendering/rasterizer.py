@@ -77,7 +77,7 @@ def pack_meshes(meshes: Sequence[VisualMesh]) -> MeshArrays:
         if id(mesh.texture) not in starts:
             starts[id(mesh.texture)] = size
             channels = mesh.texture.reshape(-1, 3).astype(np.uint32)
-            texels.append(channels[:, 0] | channels[:, 1] << 8 | channels[:, 2] << 16)
+            texels.append((channels << [0, 8, 16]).sum(axis=1, dtype=np.uint32))
             size += len(channels)
         height, width, _ = mesh.texture.shape
         repeats = mesh.uv.min(initial=0.0) < 0.0 or mesh.uv.max(initial=1.0) > 1.0
