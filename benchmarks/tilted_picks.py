@@ -62,6 +62,7 @@ class TiltedPick:
         object_class: Class of the picked object.
         tilt_deg: Its tilt [deg].
         planned: Whether there is a plan.
+        possible: Whether some grasp reaches both endpoints without collision.
         result: Why there is no plan, or how its execution ended.
         unstable_anyway: Whether a teleported move makes the scene unstable, too.
     """
@@ -69,6 +70,7 @@ class TiltedPick:
     object_class: str
     tilt_deg: float
     planned: bool
+    possible: bool
     result: str
     unstable_anyway: bool = False
 
@@ -147,14 +149,16 @@ class TiltedPicker:
         observation = self._detector.perceive(scene).observation
         command = resolve_placement(Move(LEANING), observation, CONFIG.exploration, rng)
         if command is None:
-            return TiltedPick(name, degrees, False, "no free spot")
+            return TiltedPick(name, degrees, False, False, "no free spot")
         planner = self._executor.planner_for(scene.support)
-        plan = planner.plan(scene.objects, LEANING, command.X_TO_place)
+        arguments = (scene.objects, LEANING, command.X_TO_place)
+        plan = planner.plan(*arguments)
         if not isinstance(plan, PickPlacePlan):
-            return TiltedPick(name, degrees, False, plan.reason.value)
+            is_possible = planner.are_endpoints_reachable(*arguments)
+            return TiltedPick(name, degrees, False, is_possible, plan.reason.value)
         result = execution_result(StationSimulation(default_cell(), scene).execute(plan))
         unstable = result != CARRIED_OUT and is_unstable_when_teleported(scene, plan)
-        return TiltedPick(name, degrees, True, result, unstable)
+        return TiltedPick(name, degrees, True, True, result, unstable)
 
 
 def main(
@@ -181,10 +185,12 @@ def main(
             "command": command,
             "count": count,
             **header,
-            "planned": fraction(len(planned), len(records)),
-            "carried_out": fraction(len(carried_out), len(records)),
+            "planned_of_possible": fraction(
+                len(planned), sum(record["possible"] for record in records)
+            ),
+            "carried_out_of_planned": fraction(len(carried_out), len(planned)),
             "carried_out_unless_unstable_anyway": fraction(
-                len(carried_out), sum(not record["unstable_anyway"] for record in records)
+                len(carried_out), sum(not record["unstable_anyway"] for record in planned)
             ),
             "results": Counter(record["result"] for record in records),
             "by_class": Counter(f"{r['object_class']}: {r['result']}" for r in records),
