@@ -108,6 +108,7 @@ PARSED = {
     "mujoco_motion",
     "mutation_testing",
     "random_generator_calibration",
+    "train_bc",
 }
 """Scripts without a case of a few seconds: only their options are looked up."""
 

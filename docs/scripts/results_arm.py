@@ -3,8 +3,13 @@
 from collections.abc import Mapping
 from typing import Any
 
-from markdown_text import number, quantiles, section, significant, table
-from results_files import has_benchmark_results, read_benchmark_results
+from markdown_text import estimate, number, quantiles, section, significant, table
+from results_files import (
+    has_benchmark_results,
+    has_training_results,
+    read_benchmark_results,
+    read_training_results,
+)
 
 RUNS = (
     ("arm_moves.json", "SNOPT, 5 ms"),
@@ -20,6 +25,8 @@ SPEED = "simulation_speed.json"
 """Results file of the time of simulated moves."""
 CUPS = "cup_sensitivity.json"
 """Results file of the effect of the numbers of suction cups."""
+CLONING = "reaching_policies.json"
+"""Results file of `training/train_bc.py`."""
 OUTCOMES = {"carried out": "executed"}
 """Names of outcomes by those in results files of version 0.1."""
 PARTS = {
@@ -333,6 +340,35 @@ def _cups() -> str:
     )
 
 
+def _cloning() -> str:
+    results = read_training_results(CLONING)
+    text = section(
+        "Policies cloned from recorded moves",
+        "Networks that reach for a given object from home, cloned from the recorded approaches of "
+        "a data set ([how to train them](../how_to/train_networks.md#reaching-policy)), control "
+        f"the arm in the station at {1 / results['control_period_s']:g} Hz. *State*: sees the "
+        "position of the object. *Depth*: sees the overhead depth image and the mask of the "
+        "object. *Reached*: the policy ends where the cup can attach to the object, which has not "
+        f"moved by more than {results['max_displacement_mm']:g} mm. Held-out moves are of other "
+        "episodes.",
+        command="python training/train_bc.py evaluate runs/bc_state runs/bc_depth --out FILE",
+        seed=", ".join(str(seed) for seed in sorted({row["seed"] for row in results["rows"]})),
+        results=[f"training/results/{CLONING}"],
+    )
+    header = ["policy sees", "moves learned from", "held-out moves", "reached", "duration [s]"]
+    rows = [
+        [
+            row["observation"],
+            str(row["moves"]),
+            str(row["held_out"]),
+            estimate(row, "reached", "reached_ci95"),
+            number(row["duration_s"]),
+        ]
+        for row in results["rows"]
+    ]
+    return text + table(header, rows)
+
+
 def page() -> str:
     """Return the page."""
     intro = (
@@ -349,4 +385,6 @@ def page() -> str:
         sections.append(_speed())
     if has_benchmark_results(CUPS):
         sections.append(_cups())
+    if has_training_results(CLONING):
+        sections.append(_cloning())
     return intro + "\n".join(sections)

@@ -3,10 +3,49 @@
 import statistics
 
 from markdown_text import estimate, number, section, table
-from results_files import read_benchmark_results
+from results_files import has_benchmark_results, read_benchmark_results
 
 SIMULATORS = {"mujoco": "MuJoCo", "pybullet": "PyBullet"}
 """Names of the simulators, by their names in the results file."""
+MOTION = "mujoco_motion.json"
+"""Results file of recorded motions in MuJoCo."""
+CONTROLS = {
+    "station": "positions, velocities and torques",
+    "delayed": "the same, one time step of Drake later",
+    "positions only": "positions",
+}
+"""What is commanded, by the controls of the results file."""
+
+
+def _motions() -> str:
+    results = read_benchmark_results(MOTION)
+    text = section(
+        "Recorded motions in MuJoCo",
+        "Random collision-free motions of the UR10 over two tool poses above the empty tray, "
+        f"recorded in Drake at {results['rate_hz']:g} Hz and commanded in MuJoCo with the exported "
+        "cell. *Deviation*: distance of the tools at the same time. *Same end*: the tools end "
+        f"within {results['max_final_deviation_mm']:g} mm. Drake's implicit position control "
+        "follows its command by one time step of 2.5 ms.",
+        command="python " + results["command"] + " --out FILE",
+        seed=results["seed"],
+        results=[f"benchmarks/results/{MOTION}"],
+    )
+    header = ["commanded", "motions", "same end"]
+    header += ["end, median [mm]", "end, largest [mm]", "way, median [mm]", "way, largest [mm]"]
+    rows = [
+        [
+            CONTROLS[row["control"]],
+            str(row["same_end"]["of"]),
+            number(row["same_end"]["fraction"]),
+            *(
+                f"{row[key][statistic]:.4g}"
+                for key in ("final_mm", "max_mm")
+                for statistic in ("median", "max")
+            ),
+        ]
+        for row in results["rows"]
+    ]
+    return text + table(header, rows)
 
 
 def page() -> str:
@@ -38,6 +77,8 @@ def page() -> str:
             for row in results["rows"]
         ],
     )
+    if has_benchmark_results(MOTION):
+        text += "\n" + _motions()
     return (
         "# Exported scenes\n\nHow exported scenes behave in other simulators "
         "([how to export](../how_to/export_scenes.md)).\n\n" + text

@@ -74,6 +74,11 @@ def read_training_results(name: str) -> dict[str, Any]:
     return content
 
 
+def has_training_results(name: str) -> bool:
+    """Return whether there is a results file in `training/results`."""
+    return (TRAINING / name).exists()
+
+
 def has_benchmark_results(name: str) -> bool:
     """Return whether there is a results file in `benchmarks/results`."""
     return (BENCHMARKS / name).exists()
