@@ -231,7 +231,7 @@ def test_a_folder_without_episodes_is_refused(tmp_path: Path) -> None:
 
 def test_the_card_states_counts_results_and_origin(dataset: Path) -> None:
     text = CardText("Two moves", "drake-clutter record --episodes 2", "BSD-3-Clause")
-    write_card(dataset, load_catalog(), DatasetFormat.LEROBOT, text)
+    write_card(dataset, load_catalog(), [DatasetFormat.LEROBOT], text)
     card = (dataset / "README.md").read_text()
     assert card.startswith("---\ntask_categories:\n- robotics\n")
     assert "license: bsd-3-clause\n" in card

@@ -210,3 +210,6 @@ def test_the_command_prints_counts_and_the_first_error(scenes: FileScenes, tmp_p
     assert json.loads(result.stdout)["episodes"] == 2
     warning = "warning the policy raised in 2 of 2 episodes, first in episode 0: InputError: move 1"
     assert warning in result.stderr
+    card = (tmp_path / "out" / "README.md").read_text(encoding="utf-8")
+    assert "| episodes | 2 |" in card
+    assert "| policy error | 2 | 100.0 % |" in card

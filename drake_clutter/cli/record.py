@@ -1,5 +1,7 @@
 """`drake-clutter record`."""
 
+import shlex
+import sys
 import time
 from collections.abc import Iterable
 from enum import Enum
@@ -134,15 +136,18 @@ def record(
 ) -> None:
     """Record episodes of a policy with the simulated arm as a data set.
 
-    Writes a file per episode in `episodes`, further formats and `summary.json`. An interrupted run
-    resumes when the same command is given again; a larger `--episodes` extends it.
+    Writes a file per episode in `episodes`, further formats, `summary.json` and a card: README.md
+    with pictures. An interrupted run resumes when the same command is given again; a larger
+    `--episodes` extends it.
     """
+    from drake_clutter.catalog import load_catalog
     from drake_clutter.commands.episode_scenes import FileScenes, find_scenes
     from drake_clutter.commands.explore_scene import read_moves
     from drake_clutter.commands.record_dataset import CameraOptions, RecordingJob, record_dataset
     from drake_clutter.recording.camera_recorder import CameraChannel
     from drake_clutter.recording.formats.dataset_format import DatasetFormat
     from drake_clutter.recording.randomization import load_randomization
+    from drake_clutter.reports.dataset_card import CardText, write_card
     from drake_clutter.reports.terminal_text import describe_dataset
 
     config = load_config_from_options(config_file, cell_file, settings)
@@ -193,6 +198,9 @@ def record(
         ray_address=ray,
         progress=progress,
     )
+    command = shlex.join(["drake-clutter", *sys.argv[1:]])
+    text = CardText(f"Moves of {Path(policy).stem} in {Path(scenes).stem}", command)
+    write_card(out, load_catalog(catalog), formats, text)
     print_result(summary, describe_dataset(summary), as_json, f"{out}")
     if errors := summary["errors"]:
         index, message = next(iter(errors.items()))

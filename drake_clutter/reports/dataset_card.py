@@ -41,7 +41,7 @@ CONTACT_SHEET_FILE = "contact_sheet.png"
 FIGURES_FILE = "figures.png"
 NUM_THUMBNAILS = 24
 """Number of episodes of the contact sheet, evenly chosen."""
-_VIEW_SIZE = (480, 360)
+_VIEW_SIZE = (480, 480)
 """Width and height of the rendered views [px]: twice those of a thumbnail."""
 _CONTENT = {
     DatasetFormat.HDF5: "`episodes/episode_NNNNNN.h5`: recorded episodes, HDF5 version 2",
@@ -69,13 +69,15 @@ class CardText:
     license: str = ""
 
 
-def write_card(out: Path, catalog: Catalog, format: DatasetFormat, text: CardText) -> None:
+def write_card(
+    out: Path, catalog: Catalog, formats: Sequence[DatasetFormat], text: CardText
+) -> None:
     """Write README.md, contact sheet and figures of a data set.
 
     Args:
         out: Folder of the data set, which holds at least one episode.
         catalog: Catalog with the classes of the objects.
-        format: Format in which it was written besides HDF5.
+        formats: Formats in which it was written besides HDF5.
         text: Title, command and license.
     """
     files = find_episode_files(out)
@@ -91,7 +93,7 @@ def write_card(out: Path, catalog: Catalog, format: DatasetFormat, text: CardTex
     if thumbnails:
         write_contact_sheet(out / CONTACT_SHEET_FILE, thumbnails)
     plot_dataset(out / FIGURES_FILE, episodes)
-    write_text(out / CARD_FILE, _card(episodes, format, text))
+    write_text(out / CARD_FILE, _card(episodes, formats, text))
 
 
 def _thumbnail(episode: RecordedEpisode) -> tuple[NDArray[np.uint8], str, bool] | None:
@@ -137,7 +139,9 @@ def _render(episode: RecordedEpisode, samples: ActionSamples, row: int) -> NDArr
     return np.asarray(image[0])
 
 
-def _card(episodes: Sequence[EpisodeFigures], format: DatasetFormat, text: CardText) -> str:
+def _card(
+    episodes: Sequence[EpisodeFigures], formats: Sequence[DatasetFormat], text: CardText
+) -> str:
     """Return the text of the card."""
     rows = attempted(episodes)
     found = motions(episodes)
@@ -163,12 +167,12 @@ def _card(episodes: Sequence[EpisodeFigures], format: DatasetFormat, text: CardT
         "scenes": f"{len({e.scene_name for e in episodes})}",
         "objects of a scene": _range([len(e.object_classes) for e in episodes]),
         "seed": _list(str(seed) for seed in sorted({e.seed for e in episodes})),
-        "license": text.license or "not chosen",
+        "license": text.license or "not chosen; drake_clutter and its models: BSD-3-Clause",
         "versions": f"drake_clutter {first.versions[0]}, Drake {first.versions[1]}",
     }
     return "\n".join(
         [
-            _front_matter(format, text),
+            _front_matter(formats, text),
             f"# {text.title}",
             "",
             "Simulated pick-and-place moves of a robot arm in cluttered scenes, recorded with "
@@ -179,7 +183,7 @@ def _card(episodes: Sequence[EpisodeFigures], format: DatasetFormat, text: CardT
             "",
             "## Content",
             "",
-            *(f"- {_CONTENT[f]}" for f in dict.fromkeys((DatasetFormat.HDF5, format))),
+            *(f"- {_CONTENT[f]}" for f in dict.fromkeys((DatasetFormat.HDF5, *formats))),
             "",
             "Columns and units: `docs/reference/dataset_formats.md` of drake_clutter, and the "
             "attributes of the HDF5 files.",
@@ -216,9 +220,9 @@ def _card(episodes: Sequence[EpisodeFigures], format: DatasetFormat, text: CardT
     )
 
 
-def _front_matter(format: DatasetFormat, text: CardText) -> str:
+def _front_matter(formats: Sequence[DatasetFormat], text: CardText) -> str:
     """Return the metadata by which the Hugging Face Hub lists and shows a data set."""
-    is_lerobot = format is DatasetFormat.LEROBOT
+    is_lerobot = DatasetFormat.LEROBOT in formats
     lines = ["---", "task_categories:", "- robotics", "tags:", "- drake"]
     lines += ["- LeRobot"] if is_lerobot else []
     lines += [f"license: {text.license.lower()}"] if text.license else []
