@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -17,7 +18,13 @@ from drake_clutter.recording.recorded_episode import (
     RecordedEpisode,
 )
 from drake_clutter.robots.robot_model import load_robot
-from drake_clutter.scenes.action_samples import CHANNELS, PHASES, POSE_COLUMNS, ActionSamples
+from drake_clutter.scenes.action_samples import (
+    CHANNELS,
+    PHASES,
+    POSE_COLUMNS,
+    ActionSamples,
+    ExecutedCommands,
+)
 from drake_clutter.scenes.interfaces import Move, MoveResult
 from drake_clutter.scenes.scene import Pose
 
@@ -51,7 +58,7 @@ def episode() -> RecordedEpisode:
         SCENE, DEFAULT_CELL, (), "random", "out of moves", 7, 3, "pile", 125.0, "0.2", "1.5"
     )
     sizes = {axis: len(names) for axis, names in empty.axes.items()}
-    arrays = {
+    arrays: dict[str, Any] = {
         channel.name: random_values(
             (NUM_SAMPLES, *(sizes[axis] for axis in channel.axes)), channel.dtype, generator
         )
@@ -69,13 +76,22 @@ def episode() -> RecordedEpisode:
         rgb=generator.integers(0, 256, (2, 48, 64, 3)).astype(np.uint8),
         depth=generator.random((2, 48, 64)).astype(np.float32),
     )
+    executed = ExecutedCommands(
+        np.array([0.0, 0.5]),
+        generator.standard_normal((2, sizes["commands"])),
+        np.array([0.35]),
+        np.array([0.0, 0.2, 0.3, 0.5]),
+        np.array([1, 2, -1], np.int16),
+        np.array([-1, 0, -1], np.int16),
+        np.array([[False, False], [False, True], [True, False]]),
+    )
     moved = RecordedAction(
         Move("sugar_box"),
         MoveResult.PLACED,
         detail="placed",
         tool="large",
         X_TO_place=Pose((0.1, 0.2, 0.3), (0.0, 1.0, 0.0, 0.0)),
-        samples=ActionSamples(**arrays, time_step=0.005, movable=("sugar_box",)),
+        samples=ActionSamples(**arrays, time_step=0.005, movable=("sugar_box",), executed=executed),
         images={"overhead": images},
     )
     return replace(empty, actions=(NO_PLAN, moved))
@@ -95,7 +111,7 @@ def assert_equal(read: object, written: object) -> None:
         if isinstance(b, np.ndarray):
             assert a.dtype == b.dtype, field.name
             np.testing.assert_array_equal(a, b)
-        elif field.name not in ("samples", "images", "actions", "initial_scene"):
+        elif field.name not in ("samples", "executed", "images", "actions", "initial_scene"):
             assert a == b, field.name
 
 
@@ -111,6 +127,8 @@ def test_a_written_episode_is_read_back(file: Path, episode: RecordedEpisode) ->
     assert not no_plan.images
     assert moved.samples is not None
     assert_equal(moved.samples, written.samples)
+    assert written.samples is not None
+    assert_equal(moved.samples.executed, written.samples.executed)
     assert_equal(moved.images["overhead"], written.images["overhead"])
     assert not load_episode(file, CATALOG, images=False).actions[1].images
 
@@ -174,6 +192,10 @@ def replace_dataset(file: h5py.Group, name: str, values: np.ndarray) -> None:
         (
             lambda f: replace_dataset(f, "action_0002/X_TG", np.zeros((NUM_SAMPLES, 7))),
             "action_0002.X_TG: expected finite poses with unit quaternions",
+        ),
+        (
+            lambda f: replace_dataset(f, "action_0002/executed/step_start", np.zeros(2)),
+            r"action_0002/executed.step_start: expected a dataset of shape \(4,\)",
         ),
         (
             lambda f: f["action_0001"].attrs.update({"result": "lost"}),

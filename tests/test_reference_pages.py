@@ -17,7 +17,7 @@ from drake_clutter.feasibility.pose_noise import NOISE_RECORD_FIELDS
 from drake_clutter.feasibility.sequences import SEQUENCE_RECORD_FIELDS
 from drake_clutter.planning.pick_place_plan import PlanningFailureReason
 from drake_clutter.recording.hdf5_file import save_episode
-from drake_clutter.scenes.action_samples import CHANNELS
+from drake_clutter.scenes.action_samples import CHANNELS, EXECUTED_COMMANDS
 from drake_clutter.scenes.interfaces import MoveResult
 from drake_clutter.scenes.scene_file import scene_to_dict
 from drake_clutter.tasks.episode import make_teleport_backend_factory
@@ -71,7 +71,9 @@ def test_trajectory_file(tmp_path: Path) -> None:
         assert {*first_column(page, "## Attributes of the file")} == {*stored.attrs}
         action = next(group for group in stored.values() if "images" in group)
         assert {*first_column(page, "## Attributes of an action")} == {*action.attrs}
-        assert {*action} == {*(c.name for c in CHANNELS), "X_WG", "images"}
+        assert {*action} == {*(c.name for c in CHANNELS), "X_WG", "believed", "images"}
+        documented = first_column(page, "## Executed commands")
+        assert documented == [channel.name for channel in EXECUTED_COMMANDS]
         assert {*action["images/overhead"]} <= {*first_column(page, "## Images")}
 
 

@@ -22,17 +22,22 @@ def replay(
         float, typer.Option(min=0.01, max=100.0, help="Times faster than recorded.")
     ] = 1.0,
     html_file: HtmlOption = None,
+    rrd_file: Annotated[
+        Path | None,
+        typer.Option("--rrd", metavar="FILE", help="Write a recording for Rerun instead."),
+    ] = None,
     mp4_file: Annotated[
         Path | None, typer.Option("--mp4", metavar="FILE", help="Write a video instead.")
     ] = None,
     catalog: CatalogOption = None,
 ) -> None:
-    """Replay recorded arm motions in the browser (Meshcat), or write them as HTML or video."""
+    """Replay recorded arm motions in the browser (Meshcat), or write them for other viewers."""
     from drake_clutter.catalog import load_catalog
+    from drake_clutter.recording.formats.dataset_format import check_modules
     from drake_clutter.recording.hdf5_file import load_episode
     from drake_clutter.reports.recording import replay_frames
 
-    episode = load_episode(file, load_catalog(catalog), images=False)
+    episode = load_episode(file, load_catalog(catalog), images=rrd_file is not None)
     for number, action in enumerate(episode.actions, start=1):
         text = f"{number}. {action.move}: {action.result.value}"
         if action.failure_reason:
@@ -42,15 +47,22 @@ def replay(
         out_console.print(text, highlight=False)
     if all(action.samples is None for action in episode.actions):
         raise InputError(f"{file}: holds no motion; expected a file with at least one move")
+    if rrd_file is not None:
+        check_modules("--rrd", {"rerun": "rerun-sdk"})
+        from drake_clutter.recording.formats.rerun import write_rerun
+
+        write_rerun(rrd_file, episode)
+        print_line(f"Wrote {rrd_file}.")
     if mp4_file is not None:
         from drake_clutter.reports.filmstrip import render_frames
-        from drake_clutter.reports.video import VIDEO_RATE, VIDEO_SIDE, check_video, write_video
+        from drake_clutter.reports.video import VIDEO_RATE, VIDEO_SIDE, write_video
 
-        check_video()
+        check_modules("--mp4", {"av": "av"})
         frames = replay_frames(episode, speed, VIDEO_RATE)
         images = render_frames(episode.initial_scene, frames, episode.cell, VIDEO_SIDE)
-        write_video(mp4_file, progress_bar("pictures", images, 0, len(frames)))
+        times = [frame.time for frame in frames]
+        write_video(mp4_file, progress_bar("pictures", images, 0, len(frames)), times)
         print_line(f"Wrote {mp4_file}.")
-    if html_file is not None or mp4_file is None:
+    if html_file is not None or (rrd_file is None and mp4_file is None):
         frames = replay_frames(episode, speed)
         show_recording(file, episode.initial_scene, frames, episode.cell, html_file)

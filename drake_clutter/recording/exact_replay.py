@@ -1,10 +1,11 @@
 """Exact replay: the recorded commands of an action through the simulated station.
 
-replayed = replay_action(scene, episode.cell, action, episode.rate)
+replayed = replay_action(scene, episode.cell, action.samples, episode.rate)
 errors = compare_samples(action.samples, replayed)
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -12,9 +13,10 @@ from numpy.typing import NDArray
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.planning.motion_plan import CellState, MotionPlan, PlanStep
-from drake_clutter.recording.recorded_episode import RecordedAction
-from drake_clutter.scenes.action_samples import PHASES, ActionSamples
+from drake_clutter.files import InputError
+from drake_clutter.planning.motion_plan import CellState, MotionPlan, PlanStep, stay_at
+from drake_clutter.robots.robot_model import load_robot
+from drake_clutter.scenes.action_samples import PHASES, ActionSamples, ExecutedCommands
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.station.command_schedule import RecordedSchedule
 from drake_clutter.station.station_simulation import StationSimulation
@@ -25,8 +27,6 @@ MAX_JOINT_ERROR = 5e-4
 """Largest difference of a joint of an exact replay [rad]."""
 MAX_OBJECT_ERROR = 1e-3
 """Largest distance of an object's origin of an exact replay [m]."""
-_DWELLS = ("grasp", "steady", "descend", "release", "rise")
-"""Phases in which the object touches others, which must be able to move."""
 
 
 @dataclass(frozen=True)
@@ -69,32 +69,27 @@ def scene_at(scene: Scene, samples: ActionSamples, index: int) -> Scene:
 
 
 def replay_action(
-    scene: Scene, cell: WorkCell, action: RecordedAction, rate: float
+    scene: Scene, cell: WorkCell, samples: ActionSamples, rate: float
 ) -> ActionSamples:
     """Return the samples of a replayed action, in a simulation as that of the recording.
 
     Args:
         scene: Scene of the episode, for names and classes.
         cell: Work cell.
-        action: Action with samples of version 2.
+        samples: Recorded samples.
         rate: Samples per second [Hz].
+
+    Raises:
+        InputError: The samples are without the commands between them, as those of version 1.
     """
-    samples = action.samples
-    assert samples is not None
+    executed = samples.executed
+    if executed is None:
+        raise InputError("samples: have no executed commands; expected a recording of version 2")
     start = scene_at(scene, samples, 0)
-    steps, starts = _recorded_steps(cell, action, samples, start)
-    state = CellState(tuple(samples.q_commanded[0].tolist()), start.objects)
-    plan = MotionPlan(state, replace(state, objects=scene_at(scene, samples, -1).objects), steps)
-    commands = np.hstack([samples.q_commanded, samples.v_commanded, samples.torque_commanded])
-    schedule = RecordedSchedule(
-        command=PiecewisePolynomial.FirstOrderHold(samples.time, commands.T),
-        steps=steps,
-        starts=starts[:-1],
-        end_time=starts[-1],
-        gripper_targets=(),
-        gripper_commands=samples.gripper_commanded,
-        gripper_times=samples.time,
-    )
+    schedule = _recorded_schedule(cell, executed, scene.names)
+    q = tuple(executed.command[0, : samples.q.shape[1]].tolist())
+    end = CellState(q, scene_at(scene, samples, -1).objects)
+    plan = MotionPlan(CellState(q, start.objects), end, schedule.steps)
     simulation = StationSimulation(
         cell, start, movable={*samples.movable}, time_step=samples.time_step, rate=rate
     )
@@ -104,40 +99,37 @@ def replay_action(
     return replayed
 
 
-def _recorded_steps(
-    cell: WorkCell, action: RecordedAction, samples: ActionSamples, start: Scene
-) -> tuple[tuple[PlanStep, ...], tuple[float, ...]]:
-    """Return the steps of a recording, and their start times with the end of the last [s]."""
-    tools = tuple(cell.gripper.tools)
-    states = np.column_stack([samples.phase, samples.tool_commanded])
-    (changes,) = np.nonzero((np.diff(states, axis=0) != 0).any(axis=1))
-    first = [0, *(changes + 1).tolist()]
-    (idle,) = np.nonzero(samples.phase == PHASES.index("idle"))
-    end = int(idle[0]) if len(idle) else len(samples) - 1
-    bounds = [*(k for k in first if k < end), end]
-    picked = start.names.index(action.move.pick)
-    steps = list[PlanStep]()
-    for k, following in pairwise(bounds):
-        name = PHASES[samples.phase[k]] if samples.phase[k] >= 0 else ""
-        tool = tools[samples.tool_commanded[k]] if samples.tool_commanded[k] >= 0 else ""
-        times = samples.time[[k, following]]
-        commands = samples.q_commanded[[k, following]]
-        trajectory = PiecewisePolynomial.FirstOrderHold(times - times[0], commands.T)
-        touched = tuple(
-            Pose(tuple(row[4:]), tuple(row[:4]))
-            for row in samples.X_TO[[k, following], picked].tolist()
+def _recorded_schedule(
+    cell: WorkCell, executed: ExecutedCommands, object_names: Sequence[str]
+) -> RecordedSchedule:
+    """Return recorded commands as a schedule of the executor."""
+    tools = [*cell.gripper.tools, ""]
+    names = [*PHASES, ""]
+    num_joints = load_robot(cell.robot).num_joints
+    starts = executed.step_start.tolist()
+    q = executed.command[0, :num_joints]
+    steps = tuple(
+        PlanStep(names[phase], stay_at(q, end - start), tool=tools[tool])
+        for phase, tool, (start, end) in zip(
+            executed.step_phase.tolist(), executed.step_tool.tolist(), pairwise(starts), strict=True
         )
-        is_dwell = name in _DWELLS
-        steps.append(
-            PlanStep(
-                name,
-                trajectory,
-                tool=tool,
-                object_name=action.move.pick if is_dwell else "",
-                touched=touched if is_dwell else (),
-            )
-        )
-    return tuple(steps), tuple(samples.time[bounds].tolist())
+    )
+    affected = tuple(
+        frozenset(name for name, is_affected in zip(object_names, row, strict=True) if is_affected)
+        for row in executed.step_affected.tolist()
+    )
+    command, gripper = np.split(executed.command.T, [3 * num_joints])
+    hold = PiecewisePolynomial.FirstOrderHold
+    return RecordedSchedule(
+        command=hold(executed.time, command),
+        steps=steps,
+        starts=tuple(starts[:-1]),
+        end_time=starts[-1],
+        gripper_targets=((0.0, gripper[:, 0]),),
+        gripper_command=hold(executed.time, gripper) if len(gripper) else None,
+        affected=affected,
+        wait_times=tuple(executed.wait_time.tolist()),
+    )
 
 
 def compare_samples(recorded: ActionSamples, replayed: ActionSamples) -> ReplayErrors:

@@ -28,7 +28,8 @@ dataset `believed` with the poses that the policy assumed, if they are known. If
 has a dataset for each of `CHANNELS`, with the attributes `description`, `unit`, `frame` and
 `columns`, and further attributes `time_step` and `movable`. `X_WG` is a link to `X_TG`, because the
 support's frame is the world of every simulation. Images are in
-`images/CAMERA/{time, X_TC, rgb, depth, segmentation}`.
+`images/CAMERA/{time, X_TC, rgb, depth, segmentation}`. The group `executed` has the commands
+between the samples, too, see `ExecutedCommands`.
 """
 
 import json
@@ -67,9 +68,12 @@ from drake_clutter.recording.recorded_episode import (
 )
 from drake_clutter.scenes.action_samples import (
     CHANNELS,
+    EXECUTED_COMMANDS,
     PHASES,
     POSE_COLUMNS,
     ActionSamples,
+    Channel,
+    ExecutedCommands,
 )
 from drake_clutter.scenes.interfaces import Move, MoveResult
 from drake_clutter.scenes.scene import Pose
@@ -86,6 +90,8 @@ MAX_ACTIONS = 10_000
 """Largest number of actions of an episode, which take a day."""
 MAX_TIME_STEP = 0.1
 """Largest time step of a simulation [s]: objects fall through others within it."""
+MAX_KNOTS = 10 * MAX_SAMPLES
+"""Largest number of executed commands of an action, which may be closer than its samples."""
 MAX_OBJECTS = 10_000
 """Largest number of objects of a belief: more than any scene has."""
 MAX_CAMERAS = 100
@@ -203,20 +209,33 @@ def _write_action(
     if action.samples is not None:
         group.attrs["time_step"] = action.samples.time_step
         group.attrs["movable"] = _text_array(action.samples.movable)
-        for channel in CHANNELS:
-            values = getattr(action.samples, channel.name)
-            dataset = _write_dataset(group, channel.name, values.astype(channel.dtype))
-            dataset.attrs.update(
-                {
-                    "description": channel.description,
-                    "unit": channel.unit,
-                    "frame": channel.frame,
-                    "columns": _text_array(axes[channel.axes[-1]] if channel.axes else ()),
-                }
-            )
+        _write_channels(group, CHANNELS, action.samples, axes)
         group["X_WG"] = group["X_TG"]
+        if action.samples.executed is not None:
+            executed = group.create_group("executed")
+            _write_channels(executed, EXECUTED_COMMANDS, action.samples.executed, axes)
     for name, images in action.images.items():
         _write_images(group.create_group(f"images/{name}"), images)
+
+
+def _write_channels(
+    group: h5py.Group,
+    channels: Iterable[Channel],
+    record: ActionSamples | ExecutedCommands,
+    axes: Mapping[str, Sequence[str]],
+) -> None:
+    """Write the arrays of a record, each with its description."""
+    for channel in channels:
+        values = getattr(record, channel.name)
+        dataset = _write_dataset(group, channel.name, values.astype(channel.dtype))
+        dataset.attrs.update(
+            {
+                "description": channel.description,
+                "unit": channel.unit,
+                "frame": channel.frame,
+                "columns": _text_array(axes[channel.axes[-1]] if channel.axes else ()),
+            }
+        )
 
 
 def _text_array(texts: Iterable[str]) -> NDArray[Any]:
@@ -441,20 +460,14 @@ class _ActionReader:
     def _read_samples(self) -> ActionSamples:
         """Return the samples."""
         objects = self._axes["objects"]
+        num_tools = len(self._axes["tools"])
         count = self._count(self._group, "time", MAX_SAMPLES)
-        arrays = {}
-        for channel in CHANNELS:
-            shape = (count, *(len(self._axes[axis]) for axis in channel.axes))
-            arrays[channel.name] = self._array(self._group, channel.name, shape, (channel.dtype,))
-            if channel.dtype == "float64" and not np.isfinite(arrays[channel.name]).all():
-                raise input_error(f"{self._source}.{channel.name}", "expected finite numbers")
+        arrays: dict[str, Any] = {
+            channel.name: self._channel(self._group, channel, count) for channel in CHANNELS
+        }
         self._check_times(f"{self._source}.time", arrays["time"])
-        limits = {"tool_commanded": len(self._axes["tools"]), "held_object": len(objects)}
-        for name, size in {**limits, "phase": len(PHASES)}.items():
-            if not ((arrays[name] >= -1) & (arrays[name] < size)).all():
-                raise input_error(
-                    f"{self._source}.{name}", f"expected integers in [-1, {size - 1}]"
-                )
+        limits = {"tool_commanded": num_tools, "held_object": len(objects), "phase": len(PHASES)}
+        self._check_indices(self._group, arrays, limits)
         for name in ("X_TG", "X_TO"):
             self._check_poses(name, arrays[name])
         movable = self._attributes.texts("movable", len(objects))
@@ -462,7 +475,29 @@ class _ActionReader:
             problem = f"movable: {format_value(unknown[0])}"
             raise input_error(self._source, f"{problem}; expected names of objects")
         time_step = self._attributes.quantity("time_step", MAX_TIME_STEP)
-        return ActionSamples(**arrays, time_step=time_step, movable=movable)
+        executed = self._read_executed(num_tools) if "executed" in self._group else None
+        return ActionSamples(**arrays, time_step=time_step, movable=movable, executed=executed)
+
+    def _read_executed(self, num_tools: int) -> ExecutedCommands:
+        """Return the executed commands."""
+        group = self._group["executed"]
+        if not isinstance(group, h5py.Group):
+            raise input_error(f"{self._source}.executed", "is a dataset; expected a group")
+        num_knots = self._count(group, "time", MAX_KNOTS)
+        num_steps = self._count(group, "step_phase", MAX_SAMPLES)
+        counts = {"time": num_knots, "command": num_knots, "step_start": num_steps + 1}
+        counts["wait_time"] = self._count(group, "wait_time", MAX_SAMPLES, least=0)
+        arrays: dict[str, Any] = {
+            channel.name: self._channel(group, channel, counts.get(channel.name, num_steps))
+            for channel in EXECUTED_COMMANDS
+        }
+        self._check_times(self._source_of(group, "time"), arrays["time"])
+        starts = arrays["step_start"]
+        if num_knots < 2 or starts[0] != 0 or (np.diff(starts) < 0).any():
+            allowed = "at least 2 commands, and starts that do not decrease, from 0"
+            raise input_error(f"{self._source}.executed", f"expected {allowed}")
+        self._check_indices(group, arrays, {"step_phase": len(PHASES), "step_tool": num_tools})
+        return ExecutedCommands(**arrays)
 
     def _read_images(self) -> dict[str, CameraImages]:
         """Return the images by name of the camera."""
@@ -498,11 +533,11 @@ class _ActionReader:
         """Return file, group and name of a dataset, for messages."""
         return f"{self._path}:{group.name.removeprefix('/')}.{name}"
 
-    def _count(self, group: h5py.Group, name: str, most: int) -> int:
-        """Return the length of a dataset, in [1, `most`]."""
+    def _count(self, group: h5py.Group, name: str, most: int, least: int = 1) -> int:
+        """Return the length of a dataset, in [`least`, `most`]."""
         shape = getattr(group.get(name), "shape", ())
-        if not shape or not 1 <= shape[0] <= most:
-            allowed = f"a dataset with 1 to {most} values"
+        if not shape or not least <= shape[0] <= most:
+            allowed = f"a dataset with {least} to {most} values"
             raise input_error(self._source_of(group, name), f"expected {allowed}")
         return int(shape[0])
 
@@ -537,6 +572,23 @@ class _ActionReader:
             )
         values: NDArray[Any] = dataset[()]
         return values
+
+    def _channel(self, group: h5py.Group, channel: Channel, count: int) -> NDArray[Any]:
+        """Return the values of a channel with `count` rows, which are finite."""
+        shape = (count, *(len(self._axes[axis]) for axis in channel.axes))
+        values = self._array(group, channel.name, shape, (channel.dtype,))
+        if channel.dtype == "float64" and not np.isfinite(values).all():
+            raise input_error(self._source_of(group, channel.name), "expected finite numbers")
+        return values
+
+    def _check_indices(
+        self, group: h5py.Group, arrays: Mapping[str, NDArray[Any]], sizes: Mapping[str, int]
+    ) -> None:
+        """Check that indices are at least -1 and below the size of what they refer to."""
+        for name, size in sizes.items():
+            if not ((arrays[name] >= -1) & (arrays[name] < size)).all():
+                allowed = f"integers in [-1, {size - 1}]"
+                raise input_error(self._source_of(group, name), f"expected {allowed}")
 
     def _check_times(self, source: str, time: Floats) -> None:
         """Check that times are finite and increase from 0 or later."""

@@ -110,7 +110,7 @@ def _read_move(
     allowed = [member.value for member in MoveResult]
     if result not in allowed:
         raise InputError(f"{path}:{name}: result {result!r}; expected {', '.join(allowed)}")
-    values = {}
+    values: dict[str, Any] = {}
     for channel in CHANNELS:
         shape = (len(arrays["time"]), *(len(axes[axis]) for axis in channel.axes))
         default = np.full(shape, _UNKNOWN[channel.dtype], channel.dtype)

@@ -113,12 +113,16 @@ class RecordedEpisode:
         """Names along each axis of `Channel.axes`."""
         gripper = self.cell.gripper
         tools = tuple(gripper.tools)
+        joints = load_robot(self.cell.robot).joint_names
+        actuators = tuple(f"gripper_{k}" for k in range(gripper.num_actuated_joints))
+        kinds = ("position", "velocity", "torque")
         return {
-            "joints": load_robot(self.cell.robot).joint_names,
+            "joints": joints,
+            "commands": (*(f"{name} {kind}" for kind in kinds for name in joints), *actuators),
             "tools": tools,
             "cups": tools if isinstance(gripper, SuctionGripper) else (),
             "gripper_joints": tuple(f"gripper_{k}" for k in range(gripper.num_joints)),
-            "gripper_actuators": tuple(f"gripper_{k}" for k in range(gripper.num_actuated_joints)),
+            "gripper_actuators": actuators,
             "objects": self.initial_scene.names,
             "pose": POSE_COLUMNS,
         }

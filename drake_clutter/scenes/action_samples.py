@@ -75,6 +75,59 @@ CHANNELS = (
 """Quantities of `ActionSamples`, in the order of its fields."""
 
 
+EXECUTED_COMMANDS = (
+    Channel("time", "times without waiting, between which the commands are linear", "s"),
+    Channel(
+        "command",
+        "positions, velocities and torques of the joints, then positions of the gripper's joints",
+        "rad, rad/s, N m, m",
+        ("commands",),
+    ),
+    Channel("wait_time", "times at which the executor waited for the vacuum", "s"),
+    Channel("step_start", "start of each step of the plan, and the end of the last", "s"),
+    Channel("step_phase", "index of each step's phase, -1 for another name", "", dtype="int16"),
+    Channel("step_tool", "index of the tool that is to hold, -1 for none", "", dtype="int16"),
+    Channel(
+        "step_affected",
+        "whether each object may be disturbed by the step",
+        "",
+        ("objects",),
+        dtype="bool",
+    ),
+)
+"""Quantities of `ExecutedCommands`, in the order of its fields."""
+
+
+@dataclass(frozen=True, eq=False)
+class ExecutedCommands:
+    """Commands of an action exactly as they were executed; for replays.
+
+    Samples lose what happens between them, such as the instant at which the vacuum is switched, and
+    a pile that collapses amplifies the smallest difference.
+
+    Attributes:
+        time: Times since the start of the action, without the time of waiting, between which the
+            commands are linear [s]. Shape (k,).
+        command: Commanded positions [rad], velocities [rad/s] and feed-forward torques [N m] of n
+            joints, then positions of a actuated joints of the gripper [m]. Shape (k, 3 n + a).
+        wait_time: Times since the start at which the executor waited for a period. Shape (w,).
+        step_start: Start of each of s steps, and the end of the last, without the time of waiting
+            [s]. Shape (s + 1,).
+        step_phase: Index of each step in `PHASES`; -1 for another name. Shape (s,).
+        step_tool: Index of the tool that each step commands to hold; -1 for none. Shape (s,).
+        step_affected: Whether each object may be disturbed by a step and must be able to move.
+            Shape (s, o).
+    """
+
+    time: Floats
+    command: Floats
+    wait_time: Floats
+    step_start: Floats
+    step_phase: NDArray[np.int16]
+    step_tool: NDArray[np.int16]
+    step_affected: NDArray[np.bool_]
+
+
 @dataclass(frozen=True, eq=False)
 class ActionSamples:
     """Samples of one action at m times, of an arm with n joints and o objects.
@@ -101,6 +154,7 @@ class ActionSamples:
         X_TO: Pose of each object, as `POSE_COLUMNS`. Shape (m, o, 7).
         time_step: Time step of the simulation [s]; NaN if unknown.
         movable: Names of the objects that could move in the simulation.
+        executed: Commands between the samples, too; None if unknown.
     """
 
     time: Floats
@@ -122,6 +176,7 @@ class ActionSamples:
     X_TO: Floats
     time_step: float
     movable: tuple[str, ...] = field(repr=False)
+    executed: ExecutedCommands | None = field(default=None, repr=False)
 
     def __len__(self) -> int:
         """Return the number of samples."""

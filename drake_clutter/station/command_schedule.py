@@ -58,6 +58,27 @@ class CommandSchedule:
         starts = zip(self.starts, self.steps, strict=True)
         return next((start for start, step in starts if step.name == name), math.inf)
 
+    def knots(self) -> Floats:
+        """Return the times between which all commands are linear [s]. Shape (k,)."""
+        starts = [start for start, _ in self.gripper_targets[1:]] if self.num_actuated else []
+        ramps = [time + end for time in starts for end in (0.0, JAW_MOVING_TIME)]
+        inside = [time for time in ramps if 0 < time < self.end_time]
+        return np.unique([*self.command.get_segment_times(), *inside])
+
+    def commands_at(self, time: float) -> Floats:
+        """Return the commands of the arm's and the gripper's joints at a time [s].
+
+        Returns:
+            Commands, see `ExecutedCommands`. Shape (3 n + m,).
+        """
+        time = min(time, self.end_time)
+        return np.concatenate([self.command.value(time).ravel(), self.gripper_joints(time)])
+
+    @property
+    def num_actuated(self) -> int:
+        """Number of actuated joints of the gripper, m."""
+        return len(self.gripper_targets[0][1])
+
     def gripper_joints(self, time: float) -> Floats:
         """Return the commanded positions of the gripper's actuated joints at a time [s].
 
@@ -90,12 +111,15 @@ class RecordedSchedule(CommandSchedule):
     """Recorded commands, which the executor repeats without waiting or looking for contact.
 
     Attributes:
-        gripper_times: Times of the gripper's commands [s]. Shape (k,).
-        gripper_commands: Commanded positions of the gripper's actuated joints [m]. Shape (k, m).
+        gripper_command: Commanded positions of the gripper's m actuated joints [m]; None without
+            any. Shape (m,).
+        affected: Names of the objects that each step may disturb, see `affected_bodies`.
+        wait_times: Times since the start at which the executor waited [s].
     """
 
-    gripper_times: Floats
-    gripper_commands: Floats
+    gripper_command: PiecewisePolynomial | None
+    affected: tuple[frozenset[str], ...]
+    wait_times: tuple[float, ...]
 
     def gripper_joints(self, time: float) -> Floats:
         """Return the commanded positions of the gripper's actuated joints at a time [s].
@@ -103,8 +127,9 @@ class RecordedSchedule(CommandSchedule):
         Returns:
             Positions [m]. Shape (m,).
         """
-        columns = self.gripper_commands.T
-        return np.array([np.interp(time, self.gripper_times, column) for column in columns])
+        if self.gripper_command is None:
+            return np.zeros(0)
+        return np.asarray(self.gripper_command.value(time)).ravel()
 
 
 def build_command_schedule(

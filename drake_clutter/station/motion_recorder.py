@@ -6,8 +6,9 @@ that of the step before.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence, Set
 from functools import partial
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,11 +17,20 @@ from pydrake.systems.framework import Context, EventStatus
 from scipy.spatial.transform import Rotation
 
 from drake_clutter.planning.motion_plan import Plan
-from drake_clutter.scenes.action_samples import PHASES, POSE_COLUMNS, ActionSamples
+from drake_clutter.scenes.action_samples import (
+    PHASES,
+    POSE_COLUMNS,
+    ActionSamples,
+    ExecutedCommands,
+)
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.gripper_actuator import GripperActuator
-from drake_clutter.station.pick_place_executor import ExecutorState, PickPlaceExecutor
+from drake_clutter.station.pick_place_executor import (
+    EXECUTOR_UPDATE_PERIOD,
+    ExecutorState,
+    PickPlaceExecutor,
+)
 
 Floats = NDArray[np.float64]
 
@@ -115,6 +125,7 @@ class MotionRecorder:
         self._tool = self._tool_names[0]
         self._last_step = -1
         self._rows = list[_Row]()
+        self._states = list[tuple[float, ExecutorState]]()
 
     def observe(self, root: Context) -> EventStatus:
         """Record the plant if its state is that of the current time and a sample needs it.
@@ -131,6 +142,8 @@ class MotionRecorder:
             state = self._executor.state(self._executor_context)
             if self.start_time is None:
                 self._detect_start(state)
+            if self.start_time is not None and state is not self._states[-1][1]:
+                self._states.append((_update_before(time) - self.start_time, state))
             since_sample, until_sample = self._distance_to_samples(step)
             has_states = until_sample < 1 - _STEP_TOLERANCE
             if has_states or since_sample < 1 - _STEP_TOLERANCE:
@@ -145,6 +158,7 @@ class MotionRecorder:
             first = round(state.start_time / self._station.time_step)
             self._rows = [row for row in self._rows if row.step >= first]
             self._tool = plan_tool(state.plan) or self._tool_names[0]
+            self._states = [(0.0, state)]
 
     def _distance_to_samples(self, step: int) -> tuple[float, float]:
         """Return the distances of a step from the sample before and that at or after it [steps]."""
@@ -188,8 +202,13 @@ class MotionRecorder:
             ),
         )
 
-    def samples(self) -> ActionSamples:
-        """Return what was recorded since the start of the plan."""
+    def samples(self, affected: Sequence[Set[str]]) -> ActionSamples:
+        """Return what was recorded since the start of the plan.
+
+        Args:
+            affected: Names of the objects affected by each step of the plan, see
+                `affected_bodies`.
+        """
         assert self.start_time is not None
         station = self._station
         rows = self._rows
@@ -219,6 +238,9 @@ class MotionRecorder:
         X_TO = np.empty((len(rows), len(self._scene.objects), len(POSE_COLUMNS)))
         for k, o in enumerate(self._scene.objects):
             X_TO[:, k] = self._object_poses(o.name, np.asarray(columns.positions))
+        X_TO_samples = _interpolate_poses(X_TO, before, after, weight)
+        if steps[0] == 0 and self.start_time == 0:
+            X_TO_samples[0] = self._initial_poses(X_TO_samples[0])
         return ActionSamples(
             time=np.arange(count) / self._rate,
             q=at_times(columns.positions)[:, q_indices],
@@ -236,10 +258,59 @@ class MotionRecorder:
             phase=phase.astype(np.int16),
             tool_contact=tool_contact.astype(bool),
             object_contact=object_contact.astype(bool),
-            X_TO=_interpolate_poses(X_TO, before, after, weight),
+            X_TO=X_TO_samples,
             time_step=station.time_step,
             movable=tuple(station.scene_plant.bodies),
+            executed=self._executed_commands(affected),
         )
+
+    def _executed_commands(self, affected: Sequence[Set[str]]) -> ExecutedCommands:
+        """Return the commands, from all states that the executor had."""
+        _, first = self._states[0]
+        assert first.schedule is not None
+        parts = [(0.0, first.schedule)]
+        waits = list[float]()
+        for (_, earlier), (update, later) in pairwise(self._states):
+            assert later.schedule is not None
+            if later.waited > earlier.waited:
+                waits.append(update)
+            if later.schedule is not earlier.schedule:
+                parts.append((update - later.waited, later.schedule))
+        times = list[float]()
+        commands = list[Floats]()
+        ends = [*(start for start, _ in parts[1:]), math.inf]
+        for (start, schedule), end in zip(parts, ends, strict=True):
+            knots = [time for time in schedule.knots().tolist() if start < time < end]
+            # Commands may jump between two schedules: breaks must increase.
+            knots = [start + 1e-6 if times else 0.0, *knots, *([end] if math.isfinite(end) else [])]
+            times += knots
+            commands += [schedule.commands_at(time) for time in knots]
+        _, schedule = parts[-1]
+        tools = {name: k for k, name in enumerate(self._tool_names)}
+        return ExecutedCommands(
+            time=np.array(times),
+            command=np.array(commands),
+            wait_time=np.array(waits),
+            step_start=np.array([*schedule.starts, schedule.end_time]),
+            step_phase=np.array([phase_index(step.name) for step in schedule.steps], np.int16),
+            step_tool=np.array([tools.get(step.tool, -1) for step in schedule.steps], np.int16),
+            step_affected=np.array(
+                [[name in bodies for name in self._scene.names] for bodies in affected]
+            ),
+        )
+
+    def _initial_poses(self, X_TO: Floats) -> Floats:
+        """Return the poses with which the simulation began, exactly as they were given.
+
+        A pile amplifies rounding errors: replays start from the same numbers.
+
+        Args:
+            X_TO: Poses of the plant, whose signs of quaternions are kept. Shape (o, 7).
+        """
+        poses = np.array([[*o.X_TO.quaternion, *o.X_TO.translation] for o in self._scene.objects])
+        dot = (poses[:, :4] * X_TO[:, :4]).sum(axis=1, keepdims=True)
+        poses[:, :4] *= np.where(dot < 0, -1.0, 1.0)
+        return poses
 
     def _object_poses(self, name: str, positions: Floats) -> Floats:
         """Return X_TO of an object in rows of positions of the plant. Shape (rows, 7)."""
@@ -254,7 +325,17 @@ class MotionRecorder:
 def _phase(state: ExecutorState, time: float) -> int:
     """Return the index of the plan's step in `PHASES`; -1 for a step of another name."""
     name = "idle" if state.schedule is None else state.schedule.stage_at(state.elapsed(time))
+    return phase_index(name)
+
+
+def phase_index(name: str) -> int:
+    """Return the index of a step's name in `PHASES`; -1 for another name."""
     return PHASES.index(name) if name in PHASES else -1
+
+
+def _update_before(time: float) -> float:
+    """Return the time of the executor's last update before a time [s]."""
+    return EXECUTOR_UPDATE_PERIOD * math.floor(time / EXECUTOR_UPDATE_PERIOD - 1e-6)
 
 
 def plan_tool(plan: Plan) -> str:

@@ -201,10 +201,14 @@ class PickPlaceExecutor(LeafSystem):
     def _await_vacuum(self, context: Context, state: ExecutorState) -> ExecutorState:
         """Return the state, delayed if a grasp is about to end without enough vacuum."""
         gripper, schedule = self._cell.gripper, state.schedule
+        if isinstance(schedule, RecordedSchedule):
+            time = context.get_time() - state.start_time
+            if all(abs(time - t) > EXECUTOR_UPDATE_PERIOD / 2 for t in schedule.wait_times):
+                return state
+            return replace(state, waited=state.waited + EXECUTOR_UPDATE_PERIOD)
         if (
             not isinstance(gripper, SuctionGripper)
             or schedule is None
-            or isinstance(schedule, RecordedSchedule)
             or not self._vacuum.HasValue(context)
             or state.waited + EXECUTOR_UPDATE_PERIOD > gripper.grip_timeout
         ):

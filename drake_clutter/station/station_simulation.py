@@ -25,7 +25,7 @@ from drake_clutter.scenes.action_samples import ActionSamples
 from drake_clutter.scenes.scene import Pose, Scene, tilt_between
 from drake_clutter.station.body_sleep import BodySleepManager, affected_bodies, bodies_to_wake
 from drake_clutter.station.clutter_station import ClutterStation
-from drake_clutter.station.command_schedule import CommandSchedule
+from drake_clutter.station.command_schedule import CommandSchedule, RecordedSchedule
 from drake_clutter.station.grasp_constraint import WeldPair
 from drake_clutter.station.gripper_actuator import (
     GRIPPER_UPDATE_PERIOD,
@@ -301,7 +301,11 @@ class StationSimulation:
         if state.plan is not None and state.schedule is not None:
             if state.number != self._affected_plan:
                 self._affected_plan = state.number
-                self._affected = affected_bodies(self.scene.objects, state.plan)
+                self._affected = (
+                    state.schedule.affected
+                    if isinstance(state.schedule, RecordedSchedule)
+                    else affected_bodies(self.scene.objects, state.plan)
+                )
             elapsed = self.root.get_time() - state.start_time - state.waited
             required = bodies_to_wake(state.schedule, self._affected, elapsed)
             end = state.schedule.end_time + POST_MOTION_WAIT
@@ -397,8 +401,14 @@ class StationSimulation:
             lowered_distance=self.executor_state.lowered_distance,
             max_tracking_error=max_tracking_error,
             simulated_time=self.root.get_time(),
-            samples=None if self.recorder is None else self.recorder.samples(),
+            samples=self.recorded_samples(),
         )
+
+    def recorded_samples(self) -> ActionSamples | None:
+        """Return the samples since the last plan started; None without a rate or a plan."""
+        if self.recorder is None or self.recorder.start_time is None:
+            return None
+        return self.recorder.samples(self._affected)
 
     def _tracking_error(self) -> float:
         q = self.station.joint_positions(self.plant_context)

@@ -212,7 +212,7 @@ class ClosedLoop:
         recorder = self.simulation.recorder
         if recorder is None or not self.simulation.is_at_rest:
             return None
-        samples = None if recorder.start_time is None else recorder.samples()
+        samples = self.simulation.recorded_samples()
         recorder.clear()
         return samples
 

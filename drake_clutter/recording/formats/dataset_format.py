@@ -10,7 +10,7 @@ Each is written from recorded episodes below the folder of the data set:
 """
 
 import importlib.util
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from enum import Enum
 from pathlib import Path
 
@@ -48,16 +48,25 @@ def check_format(format: DatasetFormat) -> None:
     Raises:
         InputError: One is missing.
     """
+    check_modules(f"--format {format.value}", _MODULES[format])
+
+
+def check_modules(option: str, packages: Mapping[str, str]) -> None:
+    """Check that modules of the extra `data` are installed.
+
+    Args:
+        option: Option that needs them, for the message.
+        packages: Package of each module, by the module.
+
+    Raises:
+        InputError: One is missing.
+    """
     missing = [
-        package
-        for module, package in _MODULES[format].items()
-        if importlib.util.find_spec(module) is None
+        package for module, package in packages.items() if importlib.util.find_spec(module) is None
     ]
     if missing:
-        raise InputError(
-            f"--format {format.value}: needs {', '.join(missing)}; "
-            "install drake_clutter with [data]"
-        )
+        names = ", ".join(missing)
+        raise InputError(f"{option}: needs {names}; install drake_clutter with [data]")
 
 
 def convert_episodes(format: DatasetFormat, episodes: Iterable[RecordedEpisode], out: Path) -> None:

@@ -187,7 +187,9 @@ class _Logger:
     def _log_samples(self, start: float, action: RecordedAction, samples: ActionSamples) -> None:
         """Write poses, signals and the plan of an action."""
         time = start + samples.time
-        self._log_poses(time, self._bodies.poses(samples) | {"tool": samples.X_TG})
+        self._log_poses(time, self._bodies.poses(samples))
+        if np.isfinite(samples.X_TG).all():  # unknown in files of version 1
+            self._log_poses(time, {"tool": samples.X_TG})
         for signal in _JOINT_SIGNALS:
             self._send_scalars(f"signals/{signal}", time, getattr(samples, signal))
         if samples.vacuum.shape[1]:

@@ -78,7 +78,8 @@ class EpisodeBodies:
 
     def poses(self, samples: ActionSamples) -> dict[str, NDArray[np.float64]]:
         """Return X_TB of every body that is not fixed, as `POSE_COLUMNS`. Shape of each (m, 7)."""
-        poses = self._cell.link_poses(samples.q, samples.gripper)
+        # Files of version 1 do not tell the gripper's joints: its springs are shown relaxed.
+        poses = self._cell.link_poses(samples.q, np.nan_to_num(samples.gripper))
         for index, o in enumerate(self._objects):
             poses[f"objects/{o.name}"] = samples.X_TO[:, index]
         return poses
@@ -94,9 +95,11 @@ class EpisodeBodies:
     def commanded_tool_path(self, samples: ActionSamples, tool: str) -> NDArray[np.float64]:
         """Return the positions of a tool at the commanded joint positions, in T [m]. Shape (m, 3).
 
-        The springs of a compliant gripper are relaxed.
+        The springs of a compliant gripper are relaxed. Unknown commands are those of the measured
+        positions.
         """
-        return self._cell.tool_positions(samples.q_commanded, tool)
+        q = np.where(np.isnan(samples.q_commanded), samples.q, samples.q_commanded)
+        return self._cell.tool_positions(q, tool)
 
 
 class _CellBodies:
