@@ -3,16 +3,36 @@
 Frames: W is the world, C the camera, whose axes are those of W in most tests.
 """
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from conftest import DEFAULT_CELL, WORLD, random_scene, resting, rng, scene_of
 from numpy.typing import NDArray
-from pydrake.geometry import MakeRenderEngineVtk
+from pydrake.geometry import (
+    Box,
+    Capsule,
+    Cylinder,
+    Ellipsoid,
+    GeometryInstance,
+    HalfSpace,
+    MakeRenderEngineVtk,
+    Mesh,
+    PerceptionProperties,
+    QueryObject,
+    RenderLabel,
+    Rgba,
+    SceneGraph,
+    Shape,
+    Sphere,
+)
+from pydrake.math import RigidTransform
 from pydrake.systems.framework import DiagramBuilder
 from scipy.ndimage import binary_erosion
 
 from drake_clutter.cell.camera import Camera, pixel_grid
 from drake_clutter.cell.pose_spec import PoseSpec
+from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
 from drake_clutter.rendering.lighting import CAMERA_LIGHTING, Lamp, LampKind, Lighting
 from drake_clutter.rendering.mesh_renderer import SHADOW_MAP_SIZE, MeshInstances, MeshRenderer
@@ -338,6 +358,62 @@ def test_primitive_shapes(mesh: VisualMesh, volume: float) -> None:
     # Normals point outwards, as the triangles do.
     outward = np.cross(b - a, c - a)
     assert ((outward * mesh.normals[mesh.triangles].mean(axis=1)).sum(axis=1) >= 0).all()
+
+
+def registered(*shapes: tuple[Shape, RigidTransform, Rgba]) -> tuple[SceneGraph, QueryObject]:
+    """Return a scene graph with anchored shapes of labels 0, 1, ..., and its query object."""
+    scene_graph = SceneGraph()
+    source = scene_graph.RegisterSource("test")
+    for label, (shape, X_WG, color) in enumerate(shapes):
+        geometry = GeometryInstance(X_WG, shape, f"shape {label}")
+        properties = PerceptionProperties()
+        properties.AddProperty("label", "id", RenderLabel(label))
+        properties.AddProperty("phong", "diffuse", color)
+        geometry.set_perception_properties(properties)
+        scene_graph.RegisterAnchoredGeometry(source, geometry)
+    context = scene_graph.CreateDefaultContext()
+    return scene_graph, scene_graph.get_query_output_port().Eval(context)
+
+
+def test_shapes_of_a_scene_graph(tmp_path: Path) -> None:
+    """Depths and labels along the axis of shapes of known size, and colors by ambient light."""
+    cube = tmp_path / "cube.obj"
+    (tmp_path / "cube.mtl").write_text("newmtl paint\nKd 0.2 0.4 0.6\n")
+    corners = [(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
+    faces = ["1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4"]
+    lines = ["mtllib cube.mtl", *(f"v {x} {y} {z}" for x, y, z in corners), "usemtl paint"]
+    cube.write_text("\n".join([*lines, *(f"f {face}" for face in faces), ""]))
+    red = Rgba(0.8, 0.1, 0.1)
+    shapes = [
+        (Box(0.2, 0.2, 0.4), 0.2),
+        (Sphere(0.1), 0.1),
+        (Cylinder(0.1, 0.3), 0.15),
+        (Capsule(0.1, 0.3), 0.25),
+        (Ellipsoid(0.1, 0.1, 0.2), 0.2),
+        (Mesh(str(cube), np.array([0.2, 0.2, 0.6])), 0.3),
+    ]
+    placed = [
+        (shape, RigidTransform([0.4 * k - 1.0, 0.0, 2.0]), red)
+        for k, (shape, _) in enumerate(shapes)
+    ]
+    invisible = (Box(9.0, 9.0, 0.1), RigidTransform([0.0, 0.0, 0.5]), Rgba(0.0, 0.0, 0.0, 0.0))
+    scene_graph, query = registered(*placed, invisible)
+    rasterizer = PlantRasterizer(scene_graph.model_inspector())
+    camera = camera_of(33, 33, fov_y_deg=4.0)
+    column, row = (int(value) for value in camera.principal_point)
+    for k, (_, half) in enumerate(shapes):
+        X_WC = RigidTransform([0.4 * k - 1.0, 0.0, 0.0])
+        images = rasterizer.render(camera, X_WC, query, AMBIENT)
+        assert images.label[row, column] == k
+        assert images.depth[row, column] == pytest.approx(2.0 - half, abs=2e-4)
+        expected = (0.2, 0.4, 0.6) if k == len(shapes) - 1 else (0.8, 0.1, 0.1)
+        assert linear(images.color[row, column]) == pytest.approx(expected, abs=0.01)
+
+
+def test_a_shape_that_is_not_drawn_is_named() -> None:
+    scene_graph, _ = registered((HalfSpace(), RigidTransform(), Rgba(1.0, 1.0, 1.0)))
+    with pytest.raises(InputError, match="shape 0: the compiled renderer draws no HalfSpace"):
+        PlantRasterizer(scene_graph.model_inspector())
 
 
 def test_images_of_objects_equal_those_of_drake(camera: CameraRenderer) -> None:

@@ -4,6 +4,7 @@ Frames: W is the world, C the camera: z along the optical axis, x to the right o
 G is the frame of a mesh, L the view frame of a lamp.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -79,9 +80,17 @@ class _Drawing(NamedTuple):
     owner: NDArray[np.int64]
 
 
+def _multiply(A: Floats, B: Floats) -> Floats:
+    """Return the product of matrices (..., l, m) and (..., m, n).
+
+    It rounds alike on every machine, unlike that of BLAS.
+    """
+    return np.asarray((A[..., :, :, None] * B[..., None, :, :]).sum(axis=-2))
+
+
 def _compose(X_AB: Floats, X_BC: Floats) -> Floats:
     """Return X_AC for X_AB (3, 4) and X_BC (n, 3, 4) [m]."""
-    X_AC = X_AB[:, :3] @ X_BC
+    X_AC = _multiply(X_AB[:, :3], X_BC)
     X_AC[..., 3] += X_AB[:, 3]
     return np.ascontiguousarray(X_AC)
 
@@ -89,14 +98,14 @@ def _compose(X_AB: Floats, X_BC: Floats) -> Floats:
 def _invert(X_AB: Floats) -> Floats:
     """Return X_BA for X_AB (3, 4) [m]."""
     R_BA = X_AB[:, :3].T
-    return np.column_stack([R_BA, -R_BA @ X_AB[:, 3]])
+    return np.column_stack([R_BA, -_multiply(R_BA, X_AB[:, 3:])])
 
 
 def _rotation_along(direction: Floats) -> Floats:
     """Return R_CL (3, 3) of a view frame whose z axis is a direction (3,)."""
-    z = direction / np.linalg.norm(direction)
+    z = direction / math.hypot(*direction)
     x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
-    x /= np.linalg.norm(x)
+    x /= math.hypot(*x)
     return np.column_stack([x, np.cross(z, x), z])
 
 
@@ -188,11 +197,12 @@ class MeshRenderer:
         views = list[View]()
         for k, lamp in enumerate(lighting.lamps):
             vector = np.array(lamp.vector)
+            rotated = _multiply(X_CW[:, :3], vector[:, None])[:, 0]
             if lamp.kind is LampKind.DIRECTIONAL:
-                direction = vector if lamp.is_on_camera else X_CW[:, :3] @ vector
-                vectors[k] = -direction / np.linalg.norm(direction)
+                direction = vector if lamp.is_on_camera else rotated
+                vectors[k] = -direction / math.hypot(*direction)
             else:
-                vectors[k] = vector if lamp.is_on_camera else X_CW[:, :3] @ vector + X_CW[:, 3]
+                vectors[k] = vector if lamp.is_on_camera else rotated + X_CW[:, 3]
             if lamp.casts_shadows and len(mesh_ids):
                 X_LC, view = self._lamp_view(lamp, vectors[k], mesh_ids, X_CG)
                 nearest = maps[len(poses)]
@@ -239,7 +249,8 @@ class MeshRenderer:
             mesh_ids: Mesh of each instance. Shape (n,).
             X_CG: Pose of each instance. Shape (n, 3, 4).
         """
-        p_C = self._corners[mesh_ids] @ X_CG[:, :, :3].transpose(0, 2, 1) + X_CG[:, None, :, 3]
+        R_GC = X_CG[:, :, :3].transpose(0, 2, 1)
+        p_C = _multiply(self._corners[mesh_ids], R_GC) + X_CG[:, None, :, 3]
         p_C = p_C.reshape(-1, 3)
         middle = (p_C.min(axis=0) + p_C.max(axis=0)) / 2
         center = (SHADOW_MAP_SIZE - 1) / 2
@@ -247,13 +258,13 @@ class MeshRenderer:
         room = SHADOW_MAP_SIZE / 2 - 2
         if lamp.kind is LampKind.DIRECTIONAL:
             R_CL = _rotation_along(-vector)
-            p_L = (p_C - middle) @ R_CL
+            p_L = _multiply(p_C - middle, R_CL)
             scale = room / np.abs(p_L[:, :2]).max()
             X_CL = np.column_stack([R_CL, middle])
             return _invert(X_CL), View(float(scale), center, center, False, -np.inf)
         axis = middle - vector
-        R_CL = _rotation_along(axis if np.linalg.norm(axis) > NEAR_DEPTH else np.array([0, 0, 1.0]))
-        p_L = (p_C - vector) @ R_CL
+        R_CL = _rotation_along(axis if math.hypot(*axis) > NEAR_DEPTH else np.array([0, 0, 1.0]))
+        p_L = _multiply(p_C - vector, R_CL)
         depth = np.maximum(p_L[:, 2], NEAR_DEPTH)
         tangent = min(float((np.abs(p_L[:, :2]).max(axis=1) / depth).max()), MAX_LAMP_TANGENT)
         X_CL = np.column_stack([R_CL, vector])
