@@ -27,6 +27,7 @@ from drake_clutter.perception.image_dataset import (
     write_images,
 )
 from drake_clutter.rendering.lighting import LampKind
+from drake_clutter.rendering.visual_mesh import box_visual, load_visual_meshes
 from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.simulation.camera_renderer import CameraRenderer
 from drake_clutter.simulation.drop import sample_drop_scene, simulate_drop
@@ -381,6 +382,24 @@ def test_lamps_of_a_room() -> None:
         # All are above the tray: points at a positive height, directions downwards.
         assert all((lamp.vector[2] > 0) is (lamp.kind is LampKind.POINT) for lamp in lighting.lamps)
         assert lighting == script.sample_room_lighting(rng(seed))
+
+
+def test_patches_on_textures(monkeypatch: pytest.MonkeyPatch) -> None:
+    script = training_script("render_image_dataset")
+    (mesh,) = load_visual_meshes(CLASSES["sugar_box"].folder / "visual.gltf")
+    plain = box_visual((0.1, 0.1, 0.1), (0.5, 0.5, 0.5))
+    variation = script.TextureVariation(3)
+    varied = variation("sugar_box", mesh).texture
+    assert np.array_equal(varied, variation("sugar_box", mesh).texture)
+    assert not np.array_equal(varied, variation("gelatin_box", mesh).texture)
+    assert variation("floor", plain).texture.shape == (64, 64, 3)
+    # The mean factor on gray is that of the patches, about 1; their contrast is bounded.
+    gray = replace(plain, texture=np.full((64, 64, 3), 100, np.uint8))
+    factors = np.array([script.TextureVariation(k)("x", gray).texture / 100 for k in range(40)])
+    assert factors.mean() == pytest.approx(1.0, abs=0.03)
+    assert 0.02 < factors.std() < 0.25
+    monkeypatch.setattr(script, "MAX_PATCH_CONTRAST", 0.0)
+    assert np.array_equal(variation("sugar_box", mesh).texture, mesh.texture)
 
 
 def test_a_mirrored_pose_is_refused(tmp_path: Path, images: list[AnnotatedImage]) -> None:

@@ -29,15 +29,12 @@ from drake_clutter.perception.image_dataset import ImageDataset, LabeledImage
 from drake_clutter.perception.learned_detector import LearnedDetector
 from drake_clutter.perception.pose_fit import pose_error
 from drake_clutter.perception.segmentation import SegmentationNetwork
-from drake_clutter.rendering.lighting import CAMERA_LIGHTING
+from drake_clutter.rendering.scene_rasterizer import SceneRasterizer
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.seeding import item_rng
-from drake_clutter.simulation.image_renderer import (
-    ImageRenderer,
-    RendererKind,
-    make_image_renderer,
-)
+from drake_clutter.simulation.camera_renderer import CameraRenderer
+from drake_clutter.simulation.image_renderer import ImageRenderer, RendererKind
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.validation import to_plain
 from training.results_file import provenance
@@ -241,7 +238,8 @@ def main(
     config = ClutterConfig()
     all_classes = load_catalog(catalog)
     network = SegmentationNetwork.load(detector)
-    camera = make_image_renderer(renderer, config.cell.camera, CAMERA_LIGHTING)
+    renderers = {RendererKind.VTK: CameraRenderer, RendererKind.RASTER: SceneRasterizer}
+    camera: ImageRenderer = renderers[renderer](config.cell.camera)
     rows = dict[str, Any]()
     for path in scenes:
         dataset = load_scene_dataset(path, all_classes)

@@ -16,8 +16,8 @@ Randomized per item, by the renderer:
 
     vtk     two to four lamps beside the camera (direction, intensity, color temperature); the
             camera does not move
-    raster  one to three lamps of a room that cast shadows, ambient light, exposure, and the pose of
-            the camera about that of the work cell
+    raster  one to three lamps of a room that cast shadows, ambient light, exposure, patches on the
+            textures of objects and tray, and the pose of the camera about that of the work cell
 
 The dataset has the layout of BOP: the BOP toolkit reads it as split `train`. An interrupted run is
 resumed by the same command; a larger count extends the dataset. The scenes depend on --seed
@@ -25,6 +25,7 @@ alone: no scene dataset for evaluation is read.
 """
 
 import gc
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -43,6 +44,7 @@ from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.commands.job_file import open_job_folder
 from drake_clutter.config import ClutterConfig
+from drake_clutter.limits import MAX_SEED
 from drake_clutter.perception.bop_models import (
     write_dataset_camera,
     write_models,
@@ -55,14 +57,13 @@ from drake_clutter.perception.image_dataset import (
 )
 from drake_clutter.rendering.lighting import Lamp, LampKind, Lighting
 from drake_clutter.rendering.mesh_renderer import RenderedImages
+from drake_clutter.rendering.scene_rasterizer import SceneRasterizer
+from drake_clutter.rendering.visual_mesh import VisualMesh
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.seeding import item_rng
+from drake_clutter.simulation.camera_renderer import CameraRenderer, make_engine_params
 from drake_clutter.simulation.drop import sample_drop_scene, simulate_drop
-from drake_clutter.simulation.image_renderer import (
-    ImageRenderer,
-    RendererKind,
-    make_image_renderer,
-)
+from drake_clutter.simulation.image_renderer import ImageRenderer, RendererKind
 from drake_clutter.validation import to_plain
 from drake_clutter.workers.parallel_map import map_ordered
 from training.script import CatalogOption, SeedOption, WorkersOption, progress, run_script
@@ -89,6 +90,10 @@ POSITION_SPREAD = 0.003
 """Standard deviation of each coordinate of the camera's position [m]; assumed."""
 ROTATION_SPREAD_DEG = 0.2
 """Standard deviation of each angle of the camera's rotation [deg]; assumed."""
+MAX_PATCH_CONTRAST = 0.25
+"""Largest standard deviation of the patches on textures, as a factor; assumed."""
+PLAIN_TEXTURE_SIDE = 64
+"""Side of the texture with patches of a surface without a larger one [px]."""
 _PLACEMENT_TRIES = 50
 _PLACEMENT_GAP = 0.005
 """Distance to other objects, seen from above, that a placement keeps [m]."""
@@ -159,10 +164,14 @@ class ItemRenderer:
         count = self._job.num_images(item)
         is_heap = self._job.is_heap(item)
         scenes = self._heaps(count, rng) if is_heap else self._generated_scenes(count, rng)
-        camera, lighting = self._config.cell.camera, sample_lights(rng)
-        if self._job.renderer is RendererKind.RASTER:
-            camera, lighting = sample_camera(camera, rng), sample_room_lighting(rng)
-        renderer = make_image_renderer(self._job.renderer, camera, lighting)
+        camera = self._config.cell.camera
+        renderer: ImageRenderer
+        if self._job.renderer is RendererKind.VTK:
+            renderer = CameraRenderer(camera, make_engine_params(sample_lights(rng)))
+        else:
+            camera = sample_camera(camera, rng)
+            vary_texture = TextureVariation(int(rng.integers(MAX_SEED)))
+            renderer = SceneRasterizer(camera, sample_room_lighting(rng), vary_texture)
         silhouettes = dict[SceneObject, NDArray[np.bool_]]()
         images = (render_image(renderer, scene, silhouettes, rng) for scene in scenes)
         write_images(
@@ -310,6 +319,38 @@ def sample_room_lighting(rng: np.random.Generator) -> Lighting:
         lamps.append(lamp)
     ambient = float(rng.uniform(0.05, 0.4))
     return Lighting(tuple(lamps), ambient=ambient, exposure=float(rng.uniform(0.7, 1.3)))
+
+
+@dataclass(frozen=True)
+class TextureVariation:
+    """Multiplies textures by random smooth patches of color, such as stains and faded print.
+
+    Attributes:
+        seed: Seed of the patches; those of a name are always the same.
+    """
+
+    seed: int
+
+    def __call__(self, name: str, mesh: VisualMesh) -> VisualMesh:
+        """Return a mesh with patches on its texture.
+
+        Args:
+            name: Name of the class, or of the part of the tray.
+            mesh: The mesh.
+        """
+        rng = np.random.default_rng([self.seed, zlib.crc32(name.encode())])
+        patches = rng.normal(
+            1.0, rng.uniform(0.0, MAX_PATCH_CONTRAST), (*rng.integers(2, 12, 2), 3)
+        )
+        height, width, _ = mesh.texture.shape
+        size = max(width, PLAIN_TEXTURE_SIDE), max(height, PLAIN_TEXTURE_SIDE)
+        bytes_of_patches = (128 * patches).clip(0, 255).astype(np.uint8)
+        factor = np.asarray(
+            Image.fromarray(bytes_of_patches).resize(size, Image.Resampling.BICUBIC), float
+        )
+        picture = np.asarray(Image.fromarray(mesh.texture).resize(size, Image.Resampling.NEAREST))
+        texture = (picture * factor / 128).clip(0, 255).astype(np.uint8)
+        return replace(mesh, texture=texture)
 
 
 def sample_camera(camera: Camera, rng: np.random.Generator) -> Camera:

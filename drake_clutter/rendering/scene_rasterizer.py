@@ -3,7 +3,7 @@
 Frames: T is the support and the world, O an object, G a mesh, C the camera.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,16 +40,24 @@ class SceneRasterizer:
         lighting: Light of color images.
     """
 
-    def __init__(self, camera: Camera, lighting: Lighting = CAMERA_LIGHTING) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        lighting: Lighting = CAMERA_LIGHTING,
+        vary_mesh: Callable[[str, VisualMesh], VisualMesh] | None = None,
+    ) -> None:
         """Create a renderer.
 
         Args:
             camera: The camera.
             lighting: Light of color images.
+            vary_mesh: Returns what is drawn instead of a mesh, such as one with another texture;
+                or None. Args: name of the class, or of the part of the support; the mesh.
         """
         self.camera = camera
         self.lighting = lighting
         self._X_TC = np.asarray(camera.X_TC.GetAsMatrix34())
+        self._vary_mesh = vary_mesh
         self._support: Support | None = None
         self._support_poses = list[Floats]()
         self._mesh_ids = dict[ObjectClass, range]()
@@ -81,7 +89,8 @@ class SceneRasterizer:
 
     def _prepare(self, scene: Scene, indices: Sequence[int]) -> tuple[MeshRenderer, MeshInstances]:
         """Return the renderer, and the support and the objects of some indices as instances."""
-        new = {o.object_class for o in scene.objects} - set(self._mesh_ids)
+        shown = dict.fromkeys(o.object_class for o in scene.objects)
+        new = [object_class for object_class in shown if object_class not in self._mesh_ids]
         if new or scene.support != self._support:
             self._prepare_meshes(scene.support, [*self._mesh_ids, *new])
         mesh_ids = list(range(len(self._support_poses)))
@@ -102,11 +111,14 @@ class SceneRasterizer:
         meshes = list[VisualMesh]()
         self._support_poses = []
         for name, size, p_TG in support_boxes(support):
-            meshes.append(box_visual(size, support_color(name)))
+            meshes.append(self._varied(name, box_visual(size, support_color(name))))
             self._support_poses.append(np.column_stack([np.eye(3), p_TG]))
         for object_class in classes:
             parts = load_visual_meshes(object_class.folder / "visual.gltf")
             self._mesh_ids[object_class] = range(len(meshes), len(meshes) + len(parts))
-            meshes += parts
+            meshes += (self._varied(object_class.name, part) for part in parts)
         self._support = support
         self._renderer = MeshRenderer(meshes)
+
+    def _varied(self, name: str, mesh: VisualMesh) -> VisualMesh:
+        return mesh if self._vary_mesh is None else self._vary_mesh(name, mesh)

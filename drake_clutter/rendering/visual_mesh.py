@@ -57,18 +57,21 @@ _WHITE = np.full((1, 1, 3), 255, np.uint8)
 
 
 def _plain_mesh(
-    points: Floats, normals: Floats, triangles: NDArray[np.int64], color: Sequence[float]
+    points: Floats,
+    normals: Floats,
+    uv: Floats,
+    triangles: NDArray[np.int64],
+    color: Sequence[float],
 ) -> VisualMesh:
-    """Return a mesh without texture."""
+    """Return a mesh with a texture of one white pixel."""
     red, green, blue = (float(value) for value in color[:3])
-    uv = np.full((len(points), 2), 0.5)
     return VisualMesh(
         points, normals, uv, triangles, _WHITE, (red, green, blue), PRIMITIVE_ROUGHNESS
     )
 
 
 def box_visual(size: Sequence[float], color: Sequence[float]) -> VisualMesh:
-    """Return a box with its center at the origin.
+    """Return a box with its center at the origin; each face shows the whole texture.
 
     Args:
         size: Extents [m]. Shape (3,).
@@ -87,7 +90,9 @@ def box_visual(size: Sequence[float], color: Sequence[float]) -> VisualMesh:
                 normals.append(normal)
     first = 4 * np.arange(6)[:, None]
     triangles = np.vstack([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])])
-    return _plain_mesh(np.array(points) * np.asarray(size) / 2, np.array(normals), triangles, color)
+    uv = np.tile([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]], (6, 1))
+    half = np.asarray(size) / 2
+    return _plain_mesh(np.array(points) * half, np.array(normals), uv, triangles, color)
 
 
 def revolved_visual(
@@ -124,9 +129,10 @@ def revolved_visual(
             radial, vertical = normals[2 * segment + end]
             points.append(np.column_stack([radii[k] * ring, np.full(len(ring), heights[k])]))
             point_normals.append(np.column_stack([radial * ring, np.full(len(ring), vertical)]))
-    return _plain_mesh(
-        np.vstack(points), np.vstack(point_normals), np.vstack(triangles).astype(np.int64), color
-    )
+    all_points = np.vstack(points)
+    uv = np.full((len(all_points), 2), 0.5)
+    all_triangles = np.vstack(triangles).astype(np.int64)
+    return _plain_mesh(all_points, np.vstack(point_normals), uv, all_triangles, color)
 
 
 def cylinder_visual(radius: float, length: float, color: Sequence[float]) -> VisualMesh:
