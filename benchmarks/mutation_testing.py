@@ -161,9 +161,9 @@ TESTS_OF_COMPILED_CODE = (
 """Test files that reach the modules with compiled functions."""
 COMPILED = "import njit"
 """Text in modules with compiled functions."""
-TEST_LIMIT = 5.0
+TEST_LIMIT = 10.0
 """A test that takes longer is not used [s]."""
-MAX_SECONDS = 8.0
+MAX_SECONDS = 30.0
 """Processor time of the tests of a mutant without the mutant [s]."""
 OUTCOMES = ("caught", "equivalent", "survived")
 """Outcomes of mutants."""
