@@ -271,7 +271,7 @@ def _find_bodies(triangles: Ints, part: Ints, names: Sequence[str]) -> list[_Bod
     return bodies
 
 
-def _contains(mesh: trimesh.Trimesh, point: Floats) -> bool:
+def contains(mesh: trimesh.Trimesh, point: Floats) -> bool:
     """Return whether a closed surface contains a point, by its winding number."""
     a, b, c = (mesh.triangles[:, i] - point for i in range(3))
     la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
@@ -430,7 +430,7 @@ def load_object_mesh(path: Path, where: str, scale: float = 1.0) -> ObjectMesh:
     for body, surface in zip(bodies, surfaces, strict=True):
         if surface.volume < 0:
             depth = sum(
-                _contains(other, surface.triangles[0].mean(axis=0))
+                contains(other, surface.triangles[0].mean(axis=0))
                 for other in surfaces
                 if abs(other.volume) > abs(surface.volume)
             )

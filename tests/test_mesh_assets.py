@@ -20,7 +20,13 @@ from test_mesh_file import SIZE, write_cube_with_seams, write_two_materials
 from typer.testing import CliRunner
 
 from drake_clutter.assets import build_assets, convex_pieces
-from drake_clutter.assets.convex_pieces import MAX_PIECE_CORNERS, measure_deviation
+from drake_clutter.assets.convex_pieces import (
+    MAX_PIECE_CORNERS,
+    _largest_distance_outside,
+    bounded_hull,
+    measure_deviation,
+)
+from drake_clutter.assets.mesh_appearance import simplify_surface
 from drake_clutter.built_mesh import read_mesh_measures
 from drake_clutter.catalog import ObjectClass, load_catalog
 from drake_clutter.cli.app import app
@@ -281,6 +287,86 @@ def test_a_ball_has_a_bounded_number_of_corners(tmp_path: Path) -> None:
     depth = radius + float(ConvexHull(corners).equations[:, 3].max())
     assert measures.max_bulge < 1e-4  # the flat triangles of the icosphere
     assert 0.5 * depth < measures.max_recess <= depth < 0.035 * radius
+
+
+def test_a_scan_stands_on_its_flat_foot() -> None:
+    """A ball of 40 mm is cut 26 mm below its center; the foot has a radius of 30 mm.
+
+    The rim of the foot is jagged. Where two of 32 directions have the same corner, the outline lies
+    up to 1 - cos(11.25 deg) = 1.9 % of the radius inside.
+    """
+    scan = trimesh.creation.icosphere(4, 0.04)
+    scan.vertices[:, 2] = np.maximum(scan.vertices[:, 2], -0.026)
+    hull = bounded_hull(scan.vertices)
+    assert len(hull.vertices) <= MAX_PIECE_CORNERS
+    foot = hull.vertices[hull.vertices[:, 2] < -0.026 + 5e-5]
+    outline = ConvexHull(foot[:, :2])
+    inner_radius = -outline.equations[:, 2].max()
+    full = ConvexHull(scan.vertices[scan.vertices[:, 2] == -0.026, :2])
+    assert inner_radius > 0.981 * -full.equations[:, 2].max() > 0.028
+    largest = hull.facets_area.argmax()
+    assert hull.facets_normal[largest] == pytest.approx([0.0, 0.0, -1.0], abs=1e-9)
+
+
+def test_round_ends_stay_flat() -> None:
+    can = trimesh.creation.cylinder(0.035, 0.1, sections=600)
+    hull = bounded_hull(can.vertices)
+    for end in (-0.05, 0.05):
+        corners = hull.vertices[np.abs(hull.vertices[:, 2] - end) < 1e-9]
+        assert ConvexHull(corners[:, :2]).volume > 0.985 * np.pi * 0.035**2
+
+
+def test_the_distance_of_points_outside_of_a_box() -> None:
+    box = trimesh.creation.box((0.2, 0.2, 0.2))
+    points = np.array([[0.0, 0.0, 0.05], [0.103, 0.05, 0.0], [0.101, 0.101, 0.101]])
+    assert _largest_distance_outside(box, points) == pytest.approx(0.003)
+    assert _largest_distance_outside(box, points[[0, 2]]) == pytest.approx(0.001 * 3**0.5)
+    assert _largest_distance_outside(box, points[:1]) == 0.0
+
+
+def test_a_scan_with_folds_is_measured() -> None:
+    """Drake measures no distances from meshes whose triangles turn back."""
+    scan = trimesh.creation.icosphere(3, 0.04)
+    scan.vertices += rng(0).normal(0, 0.002, scan.vertices.shape)
+    bulge, recess = measure_deviation(scan, [bounded_hull(scan.vertices)])
+    assert 0.001 < bulge < 0.012
+    assert 0.0 <= recess < 0.002
+
+
+def test_a_simplified_surface_keeps_its_shape_and_texture() -> None:
+    """A ball with a flat foot; its texture is a picture seen from above."""
+    ball = trimesh.creation.icosphere(5, 0.04)
+    points = np.maximum(ball.vertices, [-1.0, -1.0, -0.026])
+    uv = points[:, :2] * 10 + 0.5
+    few, triangles, values = simplify_surface(points, ball.faces, uv[ball.faces], 2000)
+    assert 1000 < len(triangles) <= 2000
+    used = few[np.unique(triangles)]
+    assert used[:, 2].min() == pytest.approx(-0.026, abs=1e-9)
+    is_round = used[:, 2] > -0.024
+    assert np.linalg.norm(used[is_round], axis=1) == pytest.approx(0.04, abs=2e-4)
+    assert values == pytest.approx(few[triangles][:, :, :2] * 10 + 0.5)
+    simple = trimesh.Trimesh(few, triangles)
+    assert simple.volume == pytest.approx(trimesh.Trimesh(points, ball.faces).volume, rel=0.02)
+
+
+def test_colors_on_both_sides_of_a_seam_stay_apart() -> None:
+    """Two patches of one plane, red and blue, share the places of the seam but no vertices."""
+    x, y = (each.ravel() for each in np.meshgrid(np.linspace(0, 1, 21), np.linspace(0, 1, 21)))
+    left = np.column_stack([x, y, np.zeros(441)])
+    corner = np.flatnonzero((x < 0.99) & (y < 0.99))
+    half = np.vstack(
+        [
+            np.column_stack([corner, corner + 1, corner + 22]),
+            np.column_stack([corner, corner + 22, corner + 21]),
+        ]
+    )
+    triangles = np.vstack([half, half + 441])
+    colors = np.zeros((len(triangles), 3, 3))
+    colors[: len(half), :, 0] = colors[len(half) :, :, 2] = 255
+    both = np.vstack([left - [1, 0, 0], left])
+    _, few, values = simplify_surface(both, triangles, colors, 400)
+    assert 100 < len(few) <= 400
+    assert {tuple(color) for color in values.reshape(-1, 3)} == {(255, 0, 0), (0, 0, 255)}
 
 
 def test_a_scanned_box_is_one_piece(tmp_path: Path) -> None:

@@ -20,7 +20,12 @@ from drake_clutter.assets.contact_properties import (
     proximity_properties_sdf,
 )
 from drake_clutter.assets.convex_pieces import decompose_convex, measure_deviation, obj_text
-from drake_clutter.assets.mesh_appearance import has_appearance, textured_parts
+from drake_clutter.assets.mesh_appearance import (
+    MAX_VISUAL_TRIANGLES,
+    has_appearance,
+    simplify_surface,
+    textured_parts,
+)
 from drake_clutter.assets.textured_mesh import box_mesh, cylinder_mesh, gltf_text, map_strip_texture
 from drake_clutter.assets.textures import draw_texture, encode_png
 from drake_clutter.built_mesh import (
@@ -226,6 +231,17 @@ def _load_checked_mesh(object_class: ObjectClass, repair: bool) -> ObjectMesh | 
     return mesh
 
 
+def _visual_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return a mesh with at most `MAX_VISUAL_TRIANGLES` triangles."""
+    points, triangles, _ = simplify_surface(
+        np.asarray(mesh.vertices, float),
+        np.asarray(mesh.faces, np.int64),
+        np.zeros((len(mesh.faces), 3, 0)),
+        MAX_VISUAL_TRIANGLES,
+    )
+    return trimesh.Trimesh(points, triangles, process=False)
+
+
 def _make_asset_files(object_class: ObjectClass, object_mesh: ObjectMesh | None) -> dict[str, str]:
     """Return the contents of every file of a class, by file name."""
     mesh = object_mesh.solid if object_mesh is not None else None
@@ -237,7 +253,7 @@ def _make_asset_files(object_class: ObjectClass, object_mesh: ObjectMesh | None)
         files["visual.gltf"] = gltf_text(parts, repeat=True)
     else:
         if mesh is not None:
-            surface = map_strip_texture(mesh, texture.regions["side"])
+            surface = map_strip_texture(_visual_mesh(mesh), texture.regions["side"])
         elif object_class.shape is Shape.BOX:
             surface = box_mesh(object_class.size, texture.regions)
         else:

@@ -23,10 +23,10 @@ from pydrake.geometry import (
     SceneGraph,
 )
 from pydrake.math import RigidTransform
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, cKDTree
 
 from drake_clutter.files import InputError
-from drake_clutter.mesh_file import is_flat
+from drake_clutter.mesh_file import contains, is_flat
 
 Floats = NDArray[np.float64]
 """An array of floats."""
@@ -39,6 +39,17 @@ number of corners.
 """
 SURFACE_TOLERANCE = 0.0002
 """A piece gets no more corners once its surface is moved by less than this [m]."""
+_FLAT_ANGLE = np.radians(2.0)
+"""Triangles of a convex hull whose normals differ by less may be of one flat face [rad]."""
+_MIN_FLAT_FRACTION = 0.02
+"""Area of a flat face, on which an object may stand, as a fraction of that of the hull.
+
+Triangles of a ball within `_FLAT_ANGLE` make up 0.0003 of it.
+"""
+_NUM_FLAT_CANDIDATES = 200
+"""Number of triangles, the largest first, around which flat faces are searched."""
+_NUM_FLAT_CORNERS = 32
+"""Largest number of corners of a flat face: a disk with a radius of 30 mm loses 0.14 mm."""
 MAX_DENT = 0.001
 """A mesh that lies nowhere deeper than this below its convex hull counts as convex [m].
 
@@ -102,11 +113,41 @@ def _first_corners(points: Floats) -> list[int]:
     return list(dict.fromkeys([first, second, third, fourth, *extremes]))
 
 
+def _flat_faces(hull: trimesh.Trimesh) -> list[list[int]]:
+    """Return the corners of the flat faces of a convex hull, the largest face first.
+
+    Of a round face, the corners that are farthest in `_NUM_FLAT_CORNERS` directions are taken.
+
+    Returns:
+        Indices of the hull's vertices.
+    """
+    normals = np.asarray(hull.face_normals)
+    areas = np.asarray(hull.area_faces)
+    remaining = areas.copy()
+    faces = list[tuple[float, list[int]]]()
+    for _ in range(_NUM_FLAT_CANDIDATES):
+        normal = normals[remaining.argmax()]
+        members = (normals @ normal > np.cos(_FLAT_ANGLE)) & (remaining > 0)
+        area = float(areas[members].sum())
+        remaining[members] = 0.0
+        if area >= _MIN_FLAT_FRACTION * hull.area:
+            corners = np.unique(hull.faces[members])
+            axes = np.linalg.svd(normal[None])[2][1:]
+            angle = np.arange(_NUM_FLAT_CORNERS) * (2 * np.pi / _NUM_FLAT_CORNERS)
+            directions = np.array([np.cos(angle), np.sin(angle)])
+            farthest = (hull.vertices[corners] @ axes.T @ directions).argmax(axis=0)
+            faces.append((area, corners[np.unique(farthest)].tolist()))
+        if remaining.sum() < _MIN_FLAT_FRACTION * hull.area:
+            break
+    return [corners for _, corners in sorted(faces, key=lambda face: -face[0])]
+
+
 def bounded_hull(points: Floats) -> trimesh.Trimesh:
     """Return a convex hull with at most `MAX_PIECE_CORNERS` corners.
 
-    Of a hull with more corners, the corner farthest outside is added until the number or
-    `SURFACE_TOLERANCE` is reached. The result lies within the hull and has its bounding box.
+    Of a hull with more corners, those of flat faces are taken first, so that an object stands as
+    the mesh does. Then the corner farthest outside is added until the number or `SURFACE_TOLERANCE`
+    is reached. The result lies within the hull and has its bounding box.
 
     Args:
         points: Points that do not lie in a plane [m]. Shape (N, 3).
@@ -116,6 +157,10 @@ def bounded_hull(points: Floats) -> trimesh.Trimesh:
     if len(corners) <= MAX_PIECE_CORNERS:
         return full
     chosen = _first_corners(corners)
+    for face in _flat_faces(full):
+        added = [corner for corner in face if corner not in chosen]
+        if len(chosen) + len(added) <= MAX_PIECE_CORNERS:
+            chosen += added
     hull = ConvexHull(corners[chosen], incremental=True)
     while len(chosen) < MAX_PIECE_CORNERS:
         excess = _excess(hull, corners)
@@ -231,6 +276,26 @@ def _distance_query(mesh: trimesh.Trimesh) -> tuple[SceneGraph, QueryObject]:
     return scene_graph, scene_graph.get_query_output_port().Eval(context)
 
 
+def _largest_distance_outside(mesh: trimesh.Trimesh, points: Floats) -> float:
+    """Return the largest distance of points outside of a mesh from it [m]; 0 if all are inside.
+
+    Args:
+        mesh: A closed mesh.
+        points: Points [m]. Shape (N, 3).
+    """
+    centers = cKDTree(mesh.triangles_center)
+    radius = np.linalg.norm(mesh.triangles - mesh.triangles_center[:, None], axis=2).max()
+    distances = np.empty(len(points))
+    for k, (point, bound) in enumerate(zip(points, centers.query(points)[0], strict=True)):
+        near = mesh.triangles[centers.query_ball_point(point, bound + radius)]
+        closest = trimesh.triangles.closest_point(near, np.tile(point, (len(near), 1)))
+        distances[k] = np.linalg.norm(closest - point, axis=1).min()
+    for k in np.argsort(-distances):
+        if not contains(mesh, points[k]):
+            return float(distances[k])
+    return 0.0
+
+
 def measure_deviation(
     mesh: trimesh.Trimesh, pieces: Sequence[trimesh.Trimesh]
 ) -> tuple[float, float]:
@@ -244,13 +309,20 @@ def measure_deviation(
         pieces: Convex pieces that cover it.
     """
     outer: trimesh.Trimesh = trimesh.util.concatenate(_outer_bodies(mesh))  # type: ignore[assignment]
-    _scene_graph, query = _distance_query(outer)
-    bulge = 0.0
+    points = np.vstack(
+        [
+            np.vstack([p.vertices, p.vertices[p.edges_unique].mean(axis=1), p.triangles_center])
+            for p in pieces
+        ]
+    )
+    try:
+        _scene_graph, query = _distance_query(outer)
+        distances = [query.ComputeSignedDistanceToPoint(point)[0].distance for point in points]
+        bulge = max(0.0, *distances)
+    except RuntimeError:  # Drake refuses meshes with a fold of almost 180 deg, as scans have.
+        bulge = _largest_distance_outside(outer, points)
     recess = np.full(len(outer.vertices), np.inf)
     for piece in pieces:
-        edges = piece.vertices[piece.edges_unique].mean(axis=1)
-        for point in np.vstack([piece.vertices, edges, piece.triangles_center]):
-            bulge = max(bulge, query.ComputeSignedDistanceToPoint(point)[0].distance)
         recess = np.minimum(recess, _excess(ConvexHull(piece.vertices), outer.vertices))
     # The excess over planes is at most the distance, so the largest ones are computed exactly.
     farthest = np.argsort(recess)[-_NUM_EXACT_DISTANCES:]

@@ -1,13 +1,15 @@
 """Visual geometry of a user's mesh with the textures and colors of its file."""
 
 import io
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from scipy.sparse import csr_array
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components
 
 from drake_clutter.assets.textured_mesh import TexturedMesh
 from drake_clutter.files import InputError
@@ -17,11 +19,19 @@ from drake_clutter.visual_mesh import obj_companions
 Floats = NDArray[np.float64]
 """An array of floats."""
 
-MAX_TEXTURE_SIDE = 2048
+MAX_TEXTURE_SIDE = 1024
 """Largest side of a texture; larger ones are reduced [pixels].
 
 At the distance of the camera, a pixel of the image covers several of its pixels.
 """
+MAX_VISUAL_TRIANGLES = 40_000
+"""Largest number of visible triangles of a mesh; finer meshes are simplified.
+
+Those of an object of 0.2 m are then 1 to 2 mm large, less than a pixel of the image, and take less
+than 2 MB in the file.
+"""
+_CELL_GROWTH = 1.1
+"""Factor between two sizes of cells that are tried."""
 _SMOOTH_ANGLE = np.radians(30)
 """Faces whose normals differ by less are shaded as one smooth surface [rad]."""
 _COLOR_BITS = 6
@@ -103,30 +113,85 @@ def _palette_uv(colors: NDArray[np.uint8]) -> tuple[Floats, Image.Image]:
     return (uv + 0.5) / _PALETTE_SIDE, image
 
 
-def _texture_part(part: MeshPart) -> tuple[TexturedMesh, bytes]:
-    """Return a part with its texture as a PNG file."""
+def simplify_surface(
+    points: Floats, triangles: NDArray[np.int64], values: Floats, max_triangles: int
+) -> tuple[Floats, NDArray[np.int64], Floats]:
+    """Return a surface with fewer triangles, by clustering of vertices in cubic cells.
+
+    The vertices of a cell become their mean (Rossignac and Borrel 1993, "Multi-resolution 3D
+    approximations for rendering complex scenes"). Values of both sides of a seam stay apart.
+
+    Args:
+        points: Vertices [m]. Shape (V, 3).
+        triangles: Vertex indices. Shape (F, 3).
+        values: Texture coordinates or colors at the corners of the triangles. Shape (F, 3, k).
+        max_triangles: Largest number of triangles.
+
+    Returns:
+        The same three of the new surface.
+    """
+    if len(triangles) <= max_triangles:
+        return points, triangles, values
+    corners = points[triangles]
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    ).sum()
+    edges = np.vstack([triangles[:, :2], triangles[:, 1:]]).T
+    links = coo_array((np.ones(edges.shape[1], bool), edges), shape=(len(points),) * 2)
+    chart = connected_components(links, directed=False)[1]
+    size = np.sqrt(area / max_triangles) / _CELL_GROWTH
+    kept = np.ones(len(triangles), bool)
+    while kept.sum() > max_triangles:
+        size *= _CELL_GROWTH
+        cell = np.unique(np.floor(points / size), axis=0, return_inverse=True)[1].reshape(-1)
+        a, b, c = cell[triangles].T
+        kept = (a != b) & (b != c) & (c != a)
+
+    def mean_by(group: NDArray[np.int64], of_corners: Floats) -> Floats:
+        counts = np.maximum(np.bincount(group), 1)
+        columns = [np.bincount(group, each) / counts for each in of_corners.T]
+        return np.column_stack(columns) if columns else np.zeros((len(counts), 0))
+
+    # Means over the same corners keep textures that are linear in the position undistorted.
+    side = np.unique(np.column_stack([cell, chart]), axis=0, return_inverse=True)[1].reshape(-1)
+    new_points = mean_by(cell[triangles].reshape(-1), corners.reshape(-1, 3))
+    new_values = mean_by(side[triangles].reshape(-1), values.reshape(-1, values.shape[2]))
+    return new_points, cell[triangles[kept]], new_values[side[triangles[kept]]]
+
+
+def _texture_part(part: MeshPart, max_triangles: int) -> tuple[TexturedMesh, bytes]:
+    """Return a part with its texture as a PNG file.
+
+    Args:
+        part: The part.
+        max_triangles: Largest number of triangles.
+    """
     visual = part.visual
-    uv = np.full((len(part.triangles), 3, 2), 0.5)
+    values = np.full((len(part.triangles), 3, 2), 0.5)
     image: Image.Image | None = None
+    has_colors = visual.kind in ("vertex", "face")
     if visual.kind == "texture":
         image = _material_image(visual.material)
         if image is not None and visual.uv is not None:
             # trimesh counts v from the lower edge, glTF from the upper one.
-            uv = np.asarray(visual.uv, float)[part.triangles] * [1, -1] + [0, 1]
+            values = np.asarray(visual.uv, float)[part.triangles] * [1, -1] + [0, 1]
         else:
             color = tuple(int(value) for value in visual.material.main_color[:3])
             image = Image.new("RGB", (2, 2), color)
-    elif visual.kind in ("vertex", "face"):
-        if visual.kind == "vertex":
-            colors = np.asarray(visual.vertex_colors)[part.triangles, :3].mean(axis=1)
-        else:
-            colors = np.asarray(visual.face_colors)[part.triangle_ids, :3]
-        color_uv, image = _palette_uv(colors.astype(np.uint8))
-        uv = np.repeat(color_uv[:, None], 3, axis=1)
+    elif visual.kind == "vertex":
+        values = np.asarray(visual.vertex_colors, float)[part.triangles, :3]
+    elif visual.kind == "face":
+        colors = np.asarray(visual.face_colors, float)[part.triangle_ids, :3]
+        values = np.repeat(colors[:, None], 3, axis=1)
     else:
         image = Image.new("RGB", (2, 2), "#b0b7bf")
-    normals = _corner_normals(part.points, part.triangles)
-    vertices = np.concatenate([part.points[part.triangles], normals, uv], axis=2).reshape(-1, 8)
+    points, triangles, uv = simplify_surface(part.points, part.triangles, values, max_triangles)
+    if has_colors:
+        color_uv, image = _palette_uv(uv.mean(axis=1).astype(np.uint8))
+        uv = np.repeat(color_uv[:, None], 3, axis=1)
+    assert image is not None
+    normals = _corner_normals(points, triangles)
+    vertices = np.concatenate([points[triangles], normals, uv], axis=2).reshape(-1, 8)
     vertices, index = np.unique(np.round(vertices, 7), axis=0, return_inverse=True)
     surface = TexturedMesh(
         vertices[:, :3], vertices[:, 3:6], vertices[:, 6:], index.reshape(-1, 3).astype(np.int64)
@@ -137,6 +202,9 @@ def _texture_part(part: MeshPart) -> tuple[TexturedMesh, bytes]:
 def textured_parts(mesh: ObjectMesh, path: Path) -> list[tuple[TexturedMesh, bytes]]:
     """Return the parts of a mesh and their textures as PNG files.
 
+    They have at most `MAX_VISUAL_TRIANGLES` triangles together, and textures of at most
+    `MAX_TEXTURE_SIDE` pixels a side.
+
     Args:
         mesh: The mesh.
         path: Its file.
@@ -146,4 +214,6 @@ def textured_parts(mesh: ObjectMesh, path: Path) -> list[tuple[TexturedMesh, byt
     """
     if path.suffix.lower() == ".obj":
         _check_obj_companions(path)
-    return [_texture_part(part) for part in mesh.parts]
+    total = sum(len(part.triangles) for part in mesh.parts)
+    share = min(1.0, MAX_VISUAL_TRIANGLES / total)
+    return [_texture_part(part, math.ceil(share * len(part.triangles))) for part in mesh.parts]
