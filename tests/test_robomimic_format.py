@@ -70,6 +70,9 @@ def test_a_data_set_needs_an_executed_action(episode: RecordedEpisode, tmp_path:
     path = tmp_path / "robomimic.hdf5"
     with pytest.raises(InputError, match="no action was executed; expected at least one"):
         write_robomimic(path, [replace(episode, actions=episode.actions[1:2])])
+    action = replace(episode.actions[0], X_TO_place=None)
+    with pytest.raises(InputError, match="episode 0, action 1: has no placement; expected an"):
+        write_robomimic(path, [replace(episode, actions=(action,))])
     assert not list(tmp_path.iterdir())
 
 

@@ -5,7 +5,7 @@
 
 import io
 import json
-from collections import defaultdict
+from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +20,17 @@ from pydrake.geometry import Box, Mesh
 from recorded_episodes import HOME, PRESSURE, SCENE, image_level, synthetic_episode
 from rerun.chunk import RrdReader
 
+from drake_clutter.catalog import load_catalog
 from drake_clutter.recording.formats.episode_timeline import events, start_times
 from drake_clutter.recording.formats.mcap import write_mcap
 from drake_clutter.recording.formats.rerun import write_rerun
 from drake_clutter.recording.formats.visual_bodies import shape_meshes
+from drake_clutter.recording.hdf5_file import load_episode
 from drake_clutter.recording.recorded_episode import RecordedEpisode
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.action_samples import ActionSamples
 
+VERSION_1 = Path(__file__).parent / "data" / "trajectory_v1.h5"
 STARTS = (1.0, 4.0, 5.0)
 """Times of the actions: of 2 s, of none, of 2 s, with pauses of 1 s."""
 Rows = dict[str, NDArray[np.float64]]
@@ -254,3 +257,19 @@ def test_meshes_of_shapes_and_files(tmp_path: Path) -> None:
     trimesh.creation.box([0.1, 0.2, 0.3]).export(tmp_path / "box.gltf")
     (mesh,) = shape_meshes(Mesh(str(tmp_path / "box.gltf"), 2.0), (0.0, 1.0, 0.0, 1.0))
     assert mesh.extents == pytest.approx([0.2, 0.6, 0.4]), "the y axis of glTF points up"
+
+
+def test_an_episode_of_version_1_is_shown_without_what_it_does_not_hold(tmp_path: Path) -> None:
+    episode = load_episode(VERSION_1, load_catalog())
+    write_rerun(tmp_path / "episode.rrd", episode)
+    rows: Counter[str] = Counter()
+    for chunk in RrdReader(str(tmp_path / "episode.rrd")).stream():
+        rows[str(chunk.entity_path)] += chunk.num_rows
+    samples = episode.actions[0].samples
+    assert samples is not None
+    assert rows["/robot/wrist_3"] == 1 + len(samples)
+    assert "/plan" not in rows
+    write_mcap(tmp_path / "episode.mcap", episode)
+    with (tmp_path / "episode.mcap").open("rb") as file:
+        for _, _, message in make_reader(file).iter_messages(topics=["/gripper"]):
+            assert json.loads(message.data, parse_constant=pytest.fail)["vacuum"] == {}

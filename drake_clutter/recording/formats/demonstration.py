@@ -102,7 +102,8 @@ def demonstrations(episode: RecordedEpisode) -> Iterator[Demonstration]:
     An action with images has a row for each image, else one for each sample.
 
     Raises:
-        InputError: The cameras have images at different times, or at other times than the samples.
+        InputError: The cameras have images at different times, or at other times than the samples;
+            or the episode is of version 1, which does not hold the placement.
     """
     for number, action in enumerate(episode.actions, start=1):
         if action.samples is not None and len(action.samples) > 0:
@@ -114,16 +115,16 @@ def _demonstrate(
 ) -> Demonstration:
     """Return the demonstration of an action with samples."""
     rate = episode.rate
+    source = f"episode {episode.index}, action {number}"
+    place = action.X_TO_place
+    if place is None:
+        raise InputError(f"{source}: has no placement; expected an episode of version 2")
     if action.images:
-        source = f"episode {episode.index}, action {number}"
         time = _image_times(action.images, source)
         rows = _nearest_samples(samples.time, time, source)
         rate = _image_rate(time, float(np.diff(samples.time).max()))
         chosen: dict[str, Any] = {name: a[rows] for name, a in samples.channels().items()}
         samples = replace(samples, **chosen)
-    place = action.X_TO_place
-    if place is None:
-        raise ValueError(f"action {number} was executed without a placement")
     jaws = samples.gripper[:, : samples.gripper_commanded.shape[1]]
     hold = samples.tool_commanded[:, None] == np.arange(len(episode.axes["tools"]))
     command = np.column_stack([samples.q_commanded, samples.gripper_commanded, hold])

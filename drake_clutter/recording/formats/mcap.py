@@ -137,7 +137,7 @@ class _EpisodeWriter:
 
     def _write_samples(self, start: float, action: RecordedAction, samples: ActionSamples) -> None:
         """Write poses, joints, gripper and the plan of an action."""
-        if action.tool:
+        if action.tool and np.isfinite(samples.q_commanded).all():
             points = self._bodies.commanded_tool_path(samples, action.tool)
             line = LinePrimitive(
                 type=LinePrimitive.LINE_STRIP,
@@ -148,7 +148,7 @@ class _EpisodeWriter:
             line.pose.orientation.w = 1.0
             entity = SceneEntity(frame_id=ROOT_FRAME, id="plan", lines=[line])
             self._send(start, "/plan", SceneUpdate(entities=[entity]))
-        poses = self._bodies.poses(samples) | {"tool": samples.X_TG}
+        poses = self._bodies.poses(samples)
         measured = (samples.q, samples.v, samples.torque)
         commanded = (samples.q_commanded, samples.v_commanded, samples.torque_commanded)
         for row in range(len(samples)):
@@ -172,10 +172,8 @@ class _EpisodeWriter:
         tool = int(samples.tool_commanded[row])
         held = int(samples.held_object[row])
         return {
-            "vacuum": dict(zip(self._axes["cups"], samples.vacuum[row].tolist(), strict=True)),
-            "joints": dict(
-                zip(self._axes["gripper_joints"], samples.gripper[row].tolist(), strict=True)
-            ),
+            "vacuum": _known(self._axes["cups"], samples.vacuum[row]),
+            "joints": _known(self._axes["gripper_joints"], samples.gripper[row]),
             "tool": self._axes["tools"][tool] if tool >= 0 else "",
             "held_object": self._axes["objects"][held] if held >= 0 else "",
         }
@@ -258,6 +256,13 @@ def _calibration(images: CameraImages, stamp: dict[str, Any]) -> Any:
         P=[fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0],
         **stamp,
     )
+
+
+def _known(names: Sequence[str], values: NDArray[np.float64]) -> dict[str, float]:
+    """Return numbers by name; JSON has no others than finite ones."""
+    return {
+        name: float(value) for name, value in zip(names, values, strict=True) if np.isfinite(value)
+    }
 
 
 def _timestamp(time: float) -> Timestamp:

@@ -32,7 +32,7 @@ from drake_clutter.recording.formats.episode_timeline import (
     events,
     start_times,
 )
-from drake_clutter.recording.formats.visual_bodies import EpisodeBodies, VisualBody
+from drake_clutter.recording.formats.visual_bodies import TOOL, EpisodeBodies, VisualBody
 from drake_clutter.recording.recorded_episode import CameraImages, RecordedAction, RecordedEpisode
 from drake_clutter.scenes.action_samples import ActionSamples
 
@@ -50,8 +50,8 @@ IMAGE_KINDS = ("color", "depth", "segmentation")
 """Entities of the images of a camera."""
 _REFERENCE_SIDE = 0.70
 """Longer side of the support for which the viewer's eye is stated [m]; it scales with it."""
-_EYE = np.array([0.80, -2.10, 1.45])
-_EYE_TARGET = np.array([-0.15, 0.0, 0.46])
+_EYE = np.array([1.2, -1.6, 1.1])
+_EYE_TARGET = np.array([-0.15, 0.0, 0.35])
 _IMAGE_PLANE_DISTANCE = 0.15
 """Distance at which the viewer shows a camera's image in 3-D [m]."""
 
@@ -101,7 +101,7 @@ def _blueprint(episode: RecordedEpisode) -> Any:
         rrb.TimeSeriesView(origin="signals/torque", name="torque [N m]"),
         rrb.TextLogView(origin="events", name="events"),
     ]
-    hidden = [f"- /cameras/{name}/{kind}" for name in kinds for kind in ("depth", "segmentation")]
+    hidden = [f"- /cameras/{name}/{kind}" for name in kinds for kind in IMAGE_KINDS]
     scale = max(episode.initial_scene.support.size) / _REFERENCE_SIDE
     scene = rrb.Spatial3DView(
         origin="/",
@@ -111,7 +111,8 @@ def _blueprint(episode: RecordedEpisode) -> Any:
             position=scale * _EYE, look_target=scale * _EYE_TARGET, eye_up=(0.0, 0.0, 1.0)
         ),
     )
-    layout = rrb.Horizontal(scene, rrb.Vertical(*cameras, *plots), column_shares=[2, 1])
+    rows = [rrb.Horizontal(*cameras), *plots] if cameras else plots
+    layout = rrb.Horizontal(scene, rrb.Vertical(*rows), column_shares=[3, 2])
     return rrb.Blueprint(layout, collapse_panels=True)
 
 
@@ -148,7 +149,7 @@ class _Logger:
         for body in self._bodies.bodies:
             for number, mesh in enumerate(body.parts):
                 self._recording.log(_part_path(body, number), _mesh(mesh), static=True)
-        self._recording.log("tool", rr.TransformAxes3D(_AXIS_LENGTH), static=True)
+        self._recording.log(TOOL, rr.TransformAxes3D(_AXIS_LENGTH), static=True)
         axes = self._episode.axes
         for signal in _JOINT_SIGNALS:
             names = rr.SeriesLines(names=axes["joints"])
@@ -188,14 +189,12 @@ class _Logger:
         """Write poses, signals and the plan of an action."""
         time = start + samples.time
         self._log_poses(time, self._bodies.poses(samples))
-        if np.isfinite(samples.X_TG).all():  # unknown in files of version 1
-            self._log_poses(time, {"tool": samples.X_TG})
         for signal in _JOINT_SIGNALS:
             self._send_scalars(f"signals/{signal}", time, getattr(samples, signal))
         if samples.vacuum.shape[1]:
             self._send_scalars("signals/vacuum", time, samples.vacuum)
         self._send_scalars("signals/holds_object", time, (samples.held_object >= 0)[:, None])
-        if action.tool:
+        if action.tool and np.isfinite(samples.q_commanded).all():
             self._recording.set_time(TIMELINE, duration=start)
             path = self._bodies.commanded_tool_path(samples, action.tool)
             line = rr.LineStrips3D([path], colors=_PLAN_COLOR, radii=_PLAN_RADIUS)

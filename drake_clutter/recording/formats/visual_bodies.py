@@ -38,6 +38,8 @@ from drake_clutter.simulation.scene_plant import add_scene_plant
 
 WORLD = "cell"
 """Name of the body of everything that is fixed: support, pedestal and fixtures."""
+TOOL = "tool"
+"""Name of the tool's frame."""
 _ROUGHNESS = 0.8
 _DEFAULT_COLOR = (0.6, 0.6, 0.6, 1.0)
 """Color of geometry without one."""
@@ -77,11 +79,16 @@ class EpisodeBodies:
         self.bodies = (*self._cell.bodies, *objects)
 
     def poses(self, samples: ActionSamples) -> dict[str, NDArray[np.float64]]:
-        """Return X_TB of every body that is not fixed, as `POSE_COLUMNS`. Shape of each (m, 7)."""
-        # Files of version 1 do not tell the gripper's joints: its springs are shown relaxed.
+        """Return X_TB of every body that is not fixed, as `POSE_COLUMNS`. Shape of each (m, 7).
+
+        `TOOL` is the frame G of the tool that the action uses. A file of version 1 does not hold
+        it, nor the joints of the gripper, which are shown at 0.
+        """
         poses = self._cell.link_poses(samples.q, np.nan_to_num(samples.gripper))
         for index, o in enumerate(self._objects):
             poses[f"objects/{o.name}"] = samples.X_TO[:, index]
+        if np.isfinite(samples.X_TG).all():
+            poses[TOOL] = samples.X_TG
         return poses
 
     def initial_poses(self) -> dict[str, NDArray[np.float64]]:
