@@ -21,6 +21,7 @@ _MODULES = (
     "drake_clutter.commands.evaluate_explorers",
     "drake_clutter.commands.feasibility_run",
     "drake_clutter.commands.generate_scenes",
+    "drake_clutter.commands.record_dataset",
     "drake_clutter.commands.render_scene",
     "drake_clutter.commands.run_scenario",
     "drake_clutter.commands.solve_scene",

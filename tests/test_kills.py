@@ -41,6 +41,11 @@ LONG = {
     "generate in two processes": (*QUICK["generate"], "--workers", "2"),
     "evaluate in two processes": (*QUICK["evaluate"], "--workers", "2"),
     "explore with the arm": (*QUICK["explore"], "--fidelity", "arm"),
+    "record": (
+        *(CLI, "record", "--scenes", "SCENES", "--policy", "random", "--episodes", "2"),
+        *("--max-moves", "1", "--cameras", "wrist", "--resolution", "64x48", "--out", "OUT"),
+        *("--format", "robomimic"),
+    ),
     "move": (CLI, "move", "SCENE", "--pick", "upper", "--place", "tray", "--out", "OUT"),
     "move, plan": (
         *(CLI, "move", "SCENE", "--pick", "upper", "--place", "tray", "--out", "OUT"),

@@ -43,7 +43,12 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> FileScenes:
     folder = tmp_path_factory.mktemp("scenes")
     boxes = {"a": "gelatin_box", "b": "pudding_box"}
     for name, box in boxes.items():
-        scene = scene_of(resting(box, name="box"), resting("sugar_box", xy=(0.2, 0.2), name="far"))
+        # Two objects of one class: with other masses, each gets a variant of the class.
+        twins = (
+            resting("sugar_box", xy=(0.2, 0.2), name="far"),
+            resting("sugar_box", xy=(-0.2, 0.2), name="twin"),
+        )
+        scene = scene_of(resting(box, name="box"), *twins)
         save_scene(folder / f"{name}.yaml", scene, DEFAULT_CELL)
     with_can = scene_of(resting("master_chef_can", name="can"))
     save_scene(folder / "c.yaml", with_can, DEFAULT_CELL)

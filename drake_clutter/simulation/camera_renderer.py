@@ -156,7 +156,9 @@ class CameraRenderer:
     def _build(self, counts: Counter[ObjectClass], support: Support) -> None:
         """Build the diagram for numbers of objects of each class."""
         builder = DiagramBuilder()
-        names = [(f"{c.name}.{k}", c) for c, count in counts.items() for k in range(count)]
+        # The classes are numbered, as variants of a class have the same name.
+        self._class_numbers = {c: number for number, c in enumerate(counts)}
+        names = [(self._body_name(c, k), c) for c, count in counts.items() for k in range(count)]
         self._scene_plant: ScenePlant = add_scene_plant(builder, names, support, 0.01, visuals=True)
         self._scene_plant.plant.Finalize()
         visuals = " or ".join(sorted({str(c.folder / "visual.gltf") for c in counts}))
@@ -168,6 +170,10 @@ class CameraRenderer:
         self._context = self._diagram.CreateDefaultContext()
         self._counts = counts
         self._support = support
+
+    def _body_name(self, object_class: ObjectClass, index: int) -> str:
+        """Return the name of one of the bodies of a class."""
+        return f"{self._class_numbers[object_class]}.{object_class.name}.{index}"
 
     def _place_objects(self, scene: Scene, names: Collection[str]) -> dict[int, int]:
         """Show the named objects of the scene to the camera, and no others.
@@ -186,7 +192,7 @@ class CameraRenderer:
         labels = {}
         poses = dict.fromkeys(self._scene_plant.bodies, self._X_T_parked)
         for index, scene_object in enumerate(scene.objects):
-            name = f"{scene_object.object_class.name}.{free[scene_object.object_class]}"
+            name = self._body_name(scene_object.object_class, free[scene_object.object_class])
             free[scene_object.object_class] += 1
             if scene_object.name in names:
                 poses[name] = rigid_transform(scene_object.X_TO)
