@@ -1,7 +1,6 @@
 """`drake-clutter record`."""
 
 import shlex
-import sys
 import time
 from collections.abc import Iterable
 from enum import Enum
@@ -33,6 +32,8 @@ if TYPE_CHECKING:
     from drake_clutter.commands.record_dataset import EpisodeSummary
 
 _MIN_IMAGE_SIDE = 16
+_OPTIONS_OF_A_RUN = ("out", "workers", "ray", "as_json")
+"""Parameters that do not influence the data set."""
 
 
 class DataFormat(Enum):
@@ -54,6 +55,7 @@ class Channel(Enum):
 
 
 def record(
+    context: typer.Context,
     scenes: Annotated[
         str,
         typer.Option(
@@ -122,6 +124,10 @@ def record(
             "nothing.",
         ),
     ] = "",
+    license: Annotated[
+        str,
+        typer.Option(metavar="SPDX", help="License of the data, for its card, such as CC-BY-4.0."),
+    ] = "",
     max_moves: MaxMovesOption = None,
     seed: SeedOption = 0,
     workers: WorkersOption = 1,
@@ -136,18 +142,16 @@ def record(
 ) -> None:
     """Record episodes of a policy with the simulated arm as a data set.
 
-    Writes a file per episode in `episodes`, further formats, `summary.json` and a card: README.md
-    with pictures. An interrupted run resumes when the same command is given again; a larger
-    `--episodes` extends it.
+    Writes a file per episode in `episodes`, further formats, a card (`README.md`) and
+    `summary.json`. An interrupted run
+    resumes when the same command is given again; a larger `--episodes` extends it.
     """
-    from drake_clutter.catalog import load_catalog
     from drake_clutter.commands.episode_scenes import FileScenes, find_scenes
     from drake_clutter.commands.explore_scene import read_moves
     from drake_clutter.commands.record_dataset import CameraOptions, RecordingJob, record_dataset
     from drake_clutter.recording.camera_recorder import CameraChannel
     from drake_clutter.recording.formats.dataset_format import DatasetFormat
     from drake_clutter.recording.randomization import load_randomization
-    from drake_clutter.reports.dataset_card import CardText, write_card
     from drake_clutter.reports.terminal_text import describe_dataset
 
     config = load_config_from_options(config_file, cell_file, settings)
@@ -194,13 +198,12 @@ def record(
         episodes,
         formats,
         out,
+        command=_command(context),
+        license=license,
         workers=workers,
         ray_address=ray,
         progress=progress,
     )
-    command = shlex.join(["drake-clutter", *sys.argv[1:]])
-    text = CardText(f"Moves of {Path(policy).stem} in {Path(scenes).stem}", command)
-    write_card(out, load_catalog(catalog), formats, text)
     print_result(summary, describe_dataset(summary), as_json, f"{out}")
     if errors := summary["errors"]:
         index, message = next(iter(errors.items()))
@@ -211,6 +214,23 @@ def record(
             highlight=False,
             soft_wrap=True,
         )
+
+
+def _command(context: typer.Context) -> str:
+    """Return the command line with the options that determine the data set.
+
+    It is the same wherever the data set is recorded, so `--out` has a placeholder.
+    """
+    words = ["drake-clutter", str(context.info_name)]
+    for option in context.command.params:
+        value = context.params[str(option.name)]
+        if option.name in _OPTIONS_OF_A_RUN or value == option.get_default(context):
+            continue
+        values = value if isinstance(value, list | tuple) else [value]
+        for item in values:
+            text = item.value if isinstance(item, Enum) else item
+            words += [option.opts[0], str(text)]
+    return f"{shlex.join(words)} --out DIR"
 
 
 def _parse_channels(text: str) -> list[Channel]:

@@ -50,6 +50,7 @@ from drake_clutter.recording.randomization import (
     vary_poses,
 )
 from drake_clutter.recording.recorded_episode import RecordedEpisode
+from drake_clutter.reports.dataset_card import CardText, write_card
 from drake_clutter.scenes.interfaces import Move, MoveResult
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.seeding import item_rng
@@ -319,6 +320,8 @@ def record_dataset(
     formats: Sequence[DatasetFormat],
     out: Path,
     *,
+    command: str = "",
+    license: str = "",
     workers: int = 1,
     ray_address: str | None = None,
     progress: Progress = lambda episodes, num_done, total: episodes,
@@ -333,6 +336,8 @@ def record_dataset(
         num_episodes: Number of episodes at the end.
         formats: Formats of the data set; the recorded episodes are HDF5 files in any case.
         out: Folder of the data set.
+        command: Command that makes the data set, for its card; "" names this function.
+        license: SPDX identifier of the data's license, for its card; "" if none is chosen.
         workers: Number of worker processes.
         ray_address: Address of the Ray cluster that runs the workers; None runs them locally.
         progress: Wraps the new episodes.
@@ -361,6 +366,10 @@ def record_dataset(
             episodes = (load_episode(path, catalog) for path in paths)
             convert_episodes(dataset_format, episodes, out)
         summary = summarize_dataset([read_summary(path) for path in paths])
+        text = CardText(
+            f"Moves of {job.policy_name}", command or "drake_clutter.record_dataset(...)", license
+        )
+        write_card(out, catalog, formats, text)
         write_json(out / SUMMARY_FILE, summary)
     return summary
 
