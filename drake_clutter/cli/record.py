@@ -142,9 +142,9 @@ def record(
 ) -> None:
     """Record episodes of a policy with the simulated arm as a data set.
 
-    Writes a file per episode in `episodes`, further formats, a card (`README.md`) and
-    `summary.json`. An interrupted run
-    resumes when the same command is given again; a larger `--episodes` extends it.
+    Writes a file per episode in `episodes`, further formats, `summary.json` and a card: README.md
+    with pictures. An interrupted run resumes when the same command is given again; a larger
+    `--episodes` extends it.
     """
     from drake_clutter.commands.episode_scenes import FileScenes, find_scenes
     from drake_clutter.commands.explore_scene import read_moves

@@ -37,6 +37,10 @@ class SceneSource(Protocol):
     """Scenes by the number of their episode; picklable."""
 
     @property
+    def name(self) -> str:
+        """Name of the source."""
+
+    @property
     def classes(self) -> frozenset[str]:
         """Names of the classes that the objects may have."""
 
@@ -73,6 +77,12 @@ class FileScenes:
 
     scenes: Sequence[EvaluationScene]
     catalog_folder: Path | None
+
+    @property
+    def name(self) -> str:
+        """Name of the scene dataset, or of the folder of the scene files."""
+        first = self.scenes[0]
+        return first.file.parent.name if first.index is None else first.file.stem
 
     @property
     def classes(self) -> frozenset[str]:
@@ -128,6 +138,11 @@ class GeneratedScenes:
     """
 
     job: GenerationJob
+
+    @property
+    def name(self) -> str:
+        """Name of the generator."""
+        return Path(self.job.agent).stem
 
     @property
     def classes(self) -> frozenset[str]:

@@ -63,6 +63,8 @@ from drake_clutter.workers.parallel_map import map_ordered
 EPISODES_FOLDER = "episodes"
 """Folder of the recorded episodes in that of a data set."""
 SUMMARY_FILE = "summary.json"
+RANDOM = "random"
+"""Name of the policy of random legal moves."""
 MAX_PHYSICS_ATTEMPTS = 10
 """Number of drawn masses and frictions with which a scene may be unstable, one after the other."""
 _VARIATION, _POSES, _NOISE = range(1, 4)
@@ -96,9 +98,9 @@ class RecordingJob:
 
     Attributes:
         scenes: Scenes of the episodes.
-        policy: Name of an exploration policy, see `make_policy_factory`, whose episodes end when
-            every object has been seen; a list of moves, which are attempted in every scene; or a
-            function, whose episodes end when it has no move.
+        policy: Name of an exploration policy, see `make_policy_factory`; a list of moves, which are
+            attempted in every scene; or a function. The episodes of explorers end when every
+            object has been seen, those of `RANDOM`, lists and functions do not.
         config: Configuration of the simulated world.
         seed: Seed of policies, placements, simulation and randomization.
         rate: Samples per second [Hz].
@@ -264,7 +266,7 @@ class EpisodeWriter:
                     scene_name=name,
                     rate=job.rate,
                     max_moves=job.max_moves,
-                    stop_when_all_found=isinstance(job.policy, str),
+                    stop_when_all_found=isinstance(job.policy, str) and job.policy != RANDOM,
                 )
             break
         episode = replace(
@@ -366,9 +368,8 @@ def record_dataset(
             episodes = (load_episode(path, catalog) for path in paths)
             convert_episodes(dataset_format, episodes, out)
         summary = summarize_dataset([read_summary(path) for path in paths])
-        text = CardText(
-            f"Moves of {job.policy_name}", command or "drake_clutter.record_dataset(...)", license
-        )
+        title = f"Moves of {job.policy_name} in {job.scenes.name}"
+        text = CardText(title, command or "drake_clutter.record_dataset(...)", license)
         write_card(out, catalog, formats, text)
         write_json(out / SUMMARY_FILE, summary)
     return summary
