@@ -100,7 +100,10 @@ from .recording.recorded_episode import (
 )
 from .scenes.action_samples import ActionSamples as ActionSamples
 from .recording.camera_recorder import CameraChannel as CameraChannel
-from .recording.formats.dataset_format import DatasetFormat as DatasetFormat
+from .recording.formats.dataset_format import (
+    DatasetFormat as DatasetFormat,
+    convert_episodes as convert_episodes,
+)
 from .recording.randomization import RandomizationConfig as RandomizationConfig
 from .commands.episode_scenes import find_scenes as find_scenes
 from .commands.record_dataset import (
