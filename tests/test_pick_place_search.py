@@ -39,7 +39,7 @@ def search_of(
     place = picked.X_TO.translated((0.1, -0.2, 0.001 - picked.bounds_T[0][2]))
     goal = MoveGoal(picked, place, planner.config.lift_height, True, planner.robot.home)
     model = planner.collision_model(objects)
-    return planner, planner._search(model, planner.home_state(objects), goal)
+    return planner, planner._finder.search(model, planner.home_state(objects), goal)
 
 
 def test_what_is_allowed_at_the_pick_pose_of_a_stacked_box() -> None:

@@ -4,9 +4,8 @@ Frames: T is the support, G is a tool of the gripper, O is the picked object.
 """
 
 import time
-from collections.abc import Hashable, Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import replace
-from functools import lru_cache
 from itertools import chain
 
 import numpy as np
@@ -14,16 +13,15 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.trajectories import Trajectory
 
-from drake_clutter.cell.gripper import UP, Grasp, GraspFailure, GraspSampling, Gripper
+from drake_clutter.cell.gripper import Grasp
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.files import InputError, format_value
 from drake_clutter.planning.collision_model import CollisionModel
+from drake_clutter.planning.grasp_finder import GraspFinder
 from drake_clutter.planning.motion_plan import CellState
 from drake_clutter.planning.pick_place_plan import PlanningFailure, PlanningFailureReason
 from drake_clutter.planning.pick_place_search import FoundMove, MoveGoal, PickPlaceSearch
 from drake_clutter.planning.place_check import check_place
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.planning.side_grasps import side_normals
 from drake_clutter.planning.state_check import (
     JOINT_TOLERANCE,
     check_configuration,
@@ -36,10 +34,8 @@ from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.geometry import objects_resting_on
 from drake_clutter.scenes.occlusion import OccludedBox
 from drake_clutter.scenes.scene import Pose, SceneObject
-from drake_clutter.simulation.scene_plant import rigid_transform
 
 Floats = NDArray[np.float64]
-Vector = tuple[float, float, float]
 
 GraspChoice = Grasp | Sequence[Grasp] | None
 """Grasp of an object, several in the order in which they are tried, or None to sample grasps."""
@@ -55,12 +51,13 @@ class MoveFinder:
         tools: Kinematics of robot and tool, by name of the tool.
     """
 
-    def __init__(self, cell: WorkCell, config: PlannerConfig) -> None:
+    def __init__(self, cell: WorkCell, config: PlannerConfig, grasp_finder: GraspFinder) -> None:
         """Load the robot of a work cell.
 
         Args:
             cell: Work cell.
             config: Parameters of the planner.
+            grasp_finder: Finds the grasps of objects.
 
         Raises:
             InputError: The robot's model cannot be used.
@@ -69,9 +66,8 @@ class MoveFinder:
         self.config = config
         self.robot = load_robot(cell.robot)
         self.tools = {name: ToolKinematics(cell, name) for name in cell.gripper.tools}
-        self._gripper: Gripper = cell.gripper
         self._collision_models: dict[Hashable, CollisionModel] = {}
-        self._grasps = lru_cache(maxsize=256)(self._find_grasps)
+        self._grasp_finder = grasp_finder
 
     def collision_model(
         self, objects: Sequence[SceneObject], occluded: Sequence[OccludedBox] = ()
@@ -93,7 +89,7 @@ class MoveFinder:
         model.set_object_poses(objects)
         return model
 
-    def _find_pick(
+    def find_pick(
         self,
         state: CellState,
         goal: MoveGoal,
@@ -103,15 +99,21 @@ class MoveFinder:
         """Return a motion that starts with an approach, and the number of attempts.
 
         Sides of the object are grasped if there is no motion with a grasp from above.
+
+        Args:
+            state: State at the start; no object is held.
+            goal: Motion of the object.
+            grasp: Grasps of the object.
+            occluded: Occluded volumes, which count as obstacles.
         """
         start_time = time.perf_counter()
         if carried := objects_resting_on(goal.picked, state.objects):
             return PlanningFailure(PlanningFailureReason.CARRIES_OTHERS, ", ".join(carried))
         if grasp is None:
-            faces = self._graspable_faces(goal.picked)
+            faces = self._grasp_finder.graspable_faces(goal.picked)
             first = next(faces, None)
             if first is None:
-                return self._grasp_failure(goal.picked)
+                return self._grasp_finder.failure(goal.picked)
             candidates: Iterable[Sequence[Grasp]] = chain([first], faces)
         else:
             candidates = [(grasp,) if isinstance(grasp, Grasp) else grasp]
@@ -119,7 +121,7 @@ class MoveFinder:
         failure = self._check_endpoints(state, goal, model)
         if failure is not None:
             return failure
-        search = self._search(model, state, goal, occluded)
+        search = self.search(model, state, goal, occluded)
         failure = search.failures.furthest
         for grasps in candidates:
             found = self._try_grasps(search, grasps, start_time)
@@ -130,10 +132,16 @@ class MoveFinder:
                 break
         return failure
 
-    def _find_held(
+    def find_held(
         self, state: CellState, goal: MoveGoal, occluded: Sequence[OccludedBox]
     ) -> FoundMove | PlanningFailure:
-        """Return a motion that starts with a held object."""
+        """Return a motion that starts with a held object.
+
+        Args:
+            state: State at the start, with the held object.
+            goal: Motion of the object.
+            occluded: Occluded volumes, which count as obstacles.
+        """
         start_time = time.perf_counter()
         held = state.held
         assert held is not None
@@ -144,7 +152,7 @@ class MoveFinder:
         grasp = Grasp(
             held.tool, X_TG, held.payload, 1, held.insertion, held.joints_open, held.joints_held
         )
-        found = self._try_grasps(self._search(model, state, goal, occluded), (grasp,), start_time)
+        found = self._try_grasps(self.search(model, state, goal, occluded), (grasp,), start_time)
         if isinstance(found, PlanningFailure) or goal.releases or goal.end is None:
             return found
         carry = found.segments["carry"].trajectory
@@ -173,7 +181,7 @@ class MoveFinder:
                     return found
         return search.failures.furthest
 
-    def _find_transfer(
+    def find_transfer(
         self,
         state: CellState,
         X_TG: RigidTransform,
@@ -181,7 +189,15 @@ class MoveFinder:
         tool: str,
         occluded: Sequence[OccludedBox],
     ) -> Trajectory | PlanningFailure:
-        """Return a motion without an object to a pose of a tool, or to joint positions."""
+        """Return a motion without an object to a pose of a tool, or to joint positions.
+
+        Args:
+            state: State at the start.
+            X_TG: Pose of the tool at the end; not used with joint positions.
+            q_goal: Joint positions at the end; None for any with that pose. Shape (n,).
+            tool: Name of the tool.
+            occluded: Occluded volumes, which count as obstacles.
+        """
         if failure := self._check_start(state):
             return failure
         model = self.collision_model(state.objects, occluded)
@@ -222,7 +238,7 @@ class MoveFinder:
         if goal.releases and goal.X_TO_place is not None:
             # Of the motions that end with a release, only `plan` has a guarded descent.
             max_drop = self.config.max_guarded_descent if state.held is None else 0.0
-            return self._check_place(model, state.objects, goal.picked, goal.X_TO_place, max_drop)
+            return self.check_release(model, state.objects, goal.picked, goal.X_TO_place, max_drop)
         return None
 
     def _check_start(self, state: CellState) -> PlanningFailure | None:
@@ -231,7 +247,7 @@ class MoveFinder:
             self.robot, to_configuration(self.robot, state.q, "start"), "start"
         )
 
-    def _check_place(
+    def check_release(
         self,
         model: CollisionModel,
         objects: Sequence[SceneObject],
@@ -239,89 +255,33 @@ class MoveFinder:
         X_TO_place: Pose,
         max_drop: float,
     ) -> PlanningFailure | None:
-        """Return why the object cannot be released at a pose, see `check_place`."""
+        """Return why the object cannot be released at a pose, see `check_place`.
+
+        Args:
+            model: Collision model of the cell with all objects.
+            objects: All known objects.
+            picked: The object.
+            X_TO_place: Its pose.
+            max_drop: Distance by which a guarded descent can lower the object [m].
+        """
         others = [o for o in objects if o is not picked]
         placed = replace(picked, X_TO=X_TO_place)
         return check_place(placed, others, model, max_drop)
 
-    def _search(
+    def search(
         self,
         model: CollisionModel,
         state: CellState,
         goal: MoveGoal,
         occluded: Sequence[OccludedBox] = (),
     ) -> PickPlaceSearch:
-        tops = [*model.fixture_tops, *(box.top_height for box in occluded)]
-        return PickPlaceSearch(self.cell, self.config, self.tools, model, state, goal, tops)
-
-    def grasps(
-        self, scene_object: SceneObject, normal: Vector = UP
-    ) -> Sequence[Grasp] | PlanningFailure:
-        """Return the feasible grasps of an object, closest to its center of mass first.
+        """Return the search for a motion.
 
         Args:
-            scene_object: The object at its pose.
-            normal: Direction from which it is grasped: surfaces whose outward normal differs by at
-                most 45 deg count. In T; a horizontal one for a side. Shape (3,).
-
-        Raises:
-            InputError: The normal is not a direction.
+            model: Collision model of the cell with all objects.
+            state: State at the start.
+            goal: Motion of the object.
+            occluded: Occluded volumes, which count as obstacles.
         """
-        length = float(np.linalg.norm(normal))
-        if not 0 < length < np.inf:
-            raise InputError(f"normal: {format_value(list(normal))}; expected a direction")
-        x, y, z = (np.array(normal) / length).tolist()
-        return self._grasps(scene_object, (x, y, z))
-
-    def _faces(self, picked: SceneObject) -> tuple[Vector, ...]:
-        """Return the directions from which an object may be grasped; from above first."""
-        return UP, *side_normals(picked, self.robot.X_TB.translation())
-
-    def _graspable_faces(self, picked: SceneObject) -> Iterator[Sequence[Grasp]]:
-        """Yield the grasps of each face that has any, see `_faces`."""
-        for normal in self._faces(picked):
-            grasps = self._grasps(picked, normal)
-            if not isinstance(grasps, PlanningFailure):
-                yield grasps
-
-    def _grasp_failure(self, picked: SceneObject) -> PlanningFailure:
-        """Return why no face of an object has a grasp."""
-        found = (self._grasps(picked, normal) for normal in self._faces(picked))
-        from_above, *of_sides = (f for f in found if isinstance(f, PlanningFailure))
-        if from_above.reason is not PlanningFailureReason.NO_SEAL:
-            return from_above
-        # A side on which the gripper seals, but does not hold the object, is closer to a grasp.
-        return next((f for f in of_sides if f.reason is not from_above.reason), from_above)
-
-    def _find_grasps(
-        self, picked: SceneObject, normal: Vector
-    ) -> Sequence[Grasp] | PlanningFailure:
-        """Return the feasible grasps of an object, see `grasps`."""
-        if failure := self._check_payload(picked):
-            return failure
-        object_class = picked.object_class
-        grasps = self._gripper.sample_grasps(
-            object_class, rigid_transform(picked.X_TO), replace(self._sampling, normal=normal)
-        )
-        if isinstance(grasps, GraspFailure):
-            reason = PlanningFailureReason(grasps.reason.value)
-            return PlanningFailure(reason, picked.name, grasps.value)
-        return grasps
-
-    @property
-    def _sampling(self) -> GraspSampling:
-        """Parameters of grasp sampling."""
-        config = self.config
-        return GraspSampling(
-            config.grasp_spacing,
-            config.lip_gap,
-            config.max_grasps,
-            config.min_payload_acceleration,
-        )
-
-    def _check_payload(self, picked: SceneObject) -> PlanningFailure | None:
-        """Return why gripper and object exceed the payload of the robot, or None."""
-        mass = picked.object_class.mass
-        if mass + self._gripper.mass <= self.cell.robot.payload:
-            return None
-        return PlanningFailure(PlanningFailureReason.TOO_HEAVY, picked.name, mass)
+        tops = [*model.fixture_tops, *(box.top_height for box in occluded)]
+        return PickPlaceSearch(self.cell, self.config, self.tools, model, state, goal, tops)

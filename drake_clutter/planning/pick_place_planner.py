@@ -12,8 +12,11 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.trajectories import Trajectory
 
-from drake_clutter.cell.gripper import Grasp, GraspFailure
+from drake_clutter.cell.gripper import UP, Grasp
+from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.files import InputError, format_value
+from drake_clutter.planning.collision_model import CollisionModel
+from drake_clutter.planning.grasp_finder import GraspFinder, Vector
 from drake_clutter.planning.motion_plan import (
     CellState,
     HeldObject,
@@ -25,11 +28,11 @@ from drake_clutter.planning.move_finder import GraspChoice, MoveFinder
 from drake_clutter.planning.pick_place_plan import (
     PickPlacePlan,
     PlanningFailure,
-    PlanningFailureReason,
     grasp_and_carry,
     release_steps,
 )
 from drake_clutter.planning.pick_place_search import MoveGoal
+from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.state_check import (
     check_held,
     check_joint_limits,
@@ -38,10 +41,11 @@ from drake_clutter.planning.state_check import (
     find_object,
     to_configuration,
 )
+from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.geometry import objects_resting_on
 from drake_clutter.scenes.occlusion import OccludedBox
 from drake_clutter.scenes.scene import Pose, SceneObject
-from drake_clutter.simulation.scene_plant import pose_from_transform, rigid_transform
+from drake_clutter.simulation.scene_plant import pose_from_transform
 
 Floats = NDArray[np.float64]
 
@@ -49,7 +53,7 @@ _DESCENT_TOLERANCE = 0.001
 """A guarded descent that falls short by less reaches what it is planned for [m]."""
 
 
-class PickPlacePlanner(MoveFinder):
+class PickPlacePlanner:
     """Deterministic pick-and-place planner for one work cell.
 
     `plan` moves an object from home to home. The other methods plan parts of such a motion, between
@@ -61,6 +65,23 @@ class PickPlacePlanner(MoveFinder):
         robot: Robot of the cell.
         tools: Kinematics of robot and tool, by name of the tool.
     """
+
+    def __init__(self, cell: WorkCell, config: PlannerConfig) -> None:
+        """Load the robot of a work cell.
+
+        Args:
+            cell: Work cell.
+            config: Parameters of the planner.
+
+        Raises:
+            InputError: The robot's model cannot be used.
+        """
+        self.cell = cell
+        self.config = config
+        self.robot = load_robot(cell.robot)
+        self._grasp_finder = GraspFinder(cell, config, self.robot)
+        self._finder = MoveFinder(cell, config, self._grasp_finder)
+        self.tools = self._finder.tools
 
     def home_state(self, objects: Sequence[SceneObject]) -> CellState:
         """Return the state of the cell with the arm at home.
@@ -111,7 +132,7 @@ class PickPlacePlanner(MoveFinder):
         for offset in dict.fromkeys((start_offset, 0.0)):
             X_TO_start = X_TO_place.translated((0.0, 0.0, offset))
             goal = MoveGoal(picked, X_TO_start, self.config.lift_height, True, q_end)
-            found = self._find_pick(state, goal, grasp, occluded)
+            found = self._finder.find_pick(state, goal, grasp, occluded)
             if isinstance(found, PlanningFailure):
                 return replace(found, planning_time=time.perf_counter() - start_time)
             move, num_attempts = found
@@ -131,7 +152,7 @@ class PickPlacePlanner(MoveFinder):
                 break
         if plan.max_descent < self.config.max_guarded_descent:
             model = self.collision_model(objects, occluded)
-            failure = self._check_place(
+            failure = self._finder.check_release(
                 model, objects, picked, plan.X_TO_place, plan.max_descent + _DESCENT_TOLERANCE
             )
             if failure is not None:
@@ -167,7 +188,7 @@ class PickPlacePlanner(MoveFinder):
         height = self.config.lift_height if lift_height is None else lift_height
         check_positive(height, "lift_height")
         goal = MoveGoal(find_object(state.objects, pick), None, height, False, None)
-        found = self._find_pick(state, goal, grasp, occluded)
+        found = self._finder.find_pick(state, goal, grasp, occluded)
         if isinstance(found, PlanningFailure):
             return replace(found, planning_time=time.perf_counter() - start_time)
         move, _ = found
@@ -201,7 +222,7 @@ class PickPlacePlanner(MoveFinder):
         check_pose(X_TO_place, "place")
         picked = find_object(state.objects, held.name)
         goal = MoveGoal(picked, X_TO_place, self.config.lift_height, True, None)
-        found = self._find_held(state, goal, occluded)
+        found = self._finder.find_held(state, goal, occluded)
         if isinstance(found, PlanningFailure):
             return replace(found, planning_time=time.perf_counter() - start_time)
         carry, retreat = (found.segments[name].trajectory for name in ("carry", "retreat"))
@@ -253,7 +274,7 @@ class PickPlacePlanner(MoveFinder):
             if failure := check_joint_limits(self.robot, q_goal, "goal"):
                 return failure
         if state.held is None:
-            found = self._find_transfer(state, X_TG, q_goal, name, occluded)
+            found = self._finder.find_transfer(state, X_TG, q_goal, name, occluded)
         else:
             if state.held.tool != name:
                 raise InputError(
@@ -261,7 +282,7 @@ class PickPlacePlanner(MoveFinder):
                 )
             X_TO = pose_from_transform(X_TG @ state.held.X_OG.inverse())
             picked = find_object(state.objects, state.held.name)
-            move = self._find_held(
+            move = self._finder.find_held(
                 state, MoveGoal(picked, X_TO, self.config.lift_height, False, q_goal), occluded
             )
             found = move if isinstance(move, PlanningFailure) else move.segments["carry"].trajectory
@@ -301,20 +322,26 @@ class PickPlacePlanner(MoveFinder):
         """
         if tool not in self.tools:
             raise InputError(f"tool: {format_value(tool)}; expected one of {', '.join(self.tools)}")
-        object_class = picked.object_class
-        if failure := self._check_payload(picked):
-            return failure
-        X_TO = rigid_transform(picked.X_TO)
-        grasp = self._gripper.make_grasp(tool, object_class, X_TO, X_TO @ X_OG, self._sampling)
-        if isinstance(grasp, GraspFailure):
-            return PlanningFailure(
-                PlanningFailureReason(grasp.reason.value), picked.name, grasp.value
-            )
-        return grasp
+        return self._grasp_finder.make_grasp(picked, tool, X_OG)
+
+    def grasps(
+        self, scene_object: SceneObject, normal: Vector = UP
+    ) -> Sequence[Grasp] | PlanningFailure:
+        """Return the feasible grasps of a face, closest to the center of mass first.
+
+        Args:
+            scene_object: The object at its pose.
+            normal: Direction from which it is grasped: surfaces whose outward normal differs by at
+                most 45 deg count. In T; a horizontal one for a side. Shape (3,).
+
+        Raises:
+            InputError: The normal is not a direction.
+        """
+        return self._grasp_finder.grasps(scene_object, normal)
 
     def can_grasp(self, scene_object: SceneObject) -> bool:
         """Return whether the gripper has a grasp on an object that holds its weight."""
-        return any(True for _ in self._graspable_faces(scene_object))
+        return any(True for _ in self._grasp_finder.graspable_faces(scene_object))
 
     def can_pick(self, scene_object: SceneObject, objects: Sequence[SceneObject]) -> bool:
         """Return whether an object can be grasped and no other object rests on it.
@@ -326,6 +353,12 @@ class PickPlacePlanner(MoveFinder):
             objects: All known objects.
         """
         return not objects_resting_on(scene_object, objects) and self.can_grasp(scene_object)
+
+    def collision_model(
+        self, objects: Sequence[SceneObject], occluded: Sequence[OccludedBox] = ()
+    ) -> CollisionModel:
+        """Return the collision model, see `MoveFinder.collision_model`."""
+        return self._finder.collision_model(objects, occluded)
 
     def are_endpoints_reachable(
         self, objects: Sequence[SceneObject], pick: str, X_TO_place: Pose
@@ -344,16 +377,16 @@ class PickPlacePlanner(MoveFinder):
             return False
         model = self.collision_model(objects)
         max_drop = self.config.max_guarded_descent
-        if self._check_place(model, objects, picked, X_TO_place, max_drop) is not None:
+        if self._finder.check_release(model, objects, picked, X_TO_place, max_drop) is not None:
             return False
         goal = MoveGoal(picked, X_TO_place, self.config.lift_height, True, self.robot.home)
-        search = self._search(model, self.home_state(objects), goal)
-        faces = self._graspable_faces(picked)
+        search = self._finder.search(model, self.home_state(objects), goal)
+        faces = self._grasp_finder.graspable_faces(picked)
         return any(search.has_candidate(grasp) for grasps in faces for grasp in grasps)
 
     def _step(self, name: str, trajectory: Trajectory, held: HeldObject | None) -> PlanStep:
         """Return a step in which the gripper stays as it is."""
         if held is None:
-            open_joints = (0.0,) * self._gripper.num_actuated_joints
+            open_joints = (0.0,) * self.cell.gripper.num_actuated_joints
             return PlanStep(name, trajectory, joints=open_joints)
         return PlanStep(name, trajectory, held.payload, held.tool, held.joints_closed)

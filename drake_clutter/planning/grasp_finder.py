@@ -1,0 +1,132 @@
+"""Grasps of an object: from above, and on its sides.
+
+Frames: T is the support, G is a tool of the gripper, O is the object.
+"""
+
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from drake_clutter.cell.gripper import UP, Grasp, GraspFailure, GraspSampling, Gripper
+from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.files import InputError, format_value
+from drake_clutter.planning.pick_place_plan import PlanningFailure, PlanningFailureReason
+from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.planning.side_grasps import side_normals
+from drake_clutter.robots.robot_model import RobotModel
+from drake_clutter.scenes.scene import SceneObject
+from drake_clutter.simulation.scene_plant import rigid_transform
+
+Vector = tuple[float, float, float]
+
+
+class GraspFinder:
+    """Finds the grasps of the gripper of a work cell; those of the latest objects are cached."""
+
+    def __init__(self, cell: WorkCell, config: PlannerConfig, robot: RobotModel) -> None:
+        """Take the gripper.
+
+        Args:
+            cell: Work cell with the gripper.
+            config: Parameters of the planner.
+            robot: Robot of the cell.
+        """
+        self._gripper: Gripper = cell.gripper
+        self._payload = cell.robot.payload
+        self._config = config
+        self._robot = robot
+        self._grasps = lru_cache(maxsize=256)(self._find_grasps)
+
+    def grasps(
+        self, scene_object: SceneObject, normal: Vector = UP
+    ) -> Sequence[Grasp] | PlanningFailure:
+        """Return the feasible grasps of an object, closest to its center of mass first.
+
+        Args:
+            scene_object: The object at its pose.
+            normal: Direction from which it is grasped: surfaces whose outward normal differs by at
+                most 45 deg count. In T; a horizontal one for a side. Shape (3,).
+
+        Raises:
+            InputError: The normal is not a direction.
+        """
+        length = float(np.linalg.norm(normal))
+        if not 0 < length < np.inf:
+            raise InputError(f"normal: {format_value(list(normal))}; expected a direction")
+        x, y, z = (np.array(normal) / length).tolist()
+        return self._grasps(scene_object, (x, y, z))
+
+    def _faces(self, picked: SceneObject) -> tuple[Vector, ...]:
+        """Return the directions from which an object may be grasped; from above first."""
+        return UP, *side_normals(picked, self._robot.X_TB.translation())
+
+    def graspable_faces(self, picked: SceneObject) -> Iterator[Sequence[Grasp]]:
+        """Yield the grasps of each face that has any, see `_faces`."""
+        for normal in self._faces(picked):
+            grasps = self._grasps(picked, normal)
+            if not isinstance(grasps, PlanningFailure):
+                yield grasps
+
+    def failure(self, picked: SceneObject) -> PlanningFailure:
+        """Return why no face of an object has a grasp."""
+        found = (self._grasps(picked, normal) for normal in self._faces(picked))
+        from_above, *of_sides = (f for f in found if isinstance(f, PlanningFailure))
+        if from_above.reason is not PlanningFailureReason.NO_SEAL:
+            return from_above
+        # A side on which the gripper seals, but does not hold the object, is closer to a grasp.
+        return next((f for f in of_sides if f.reason is not from_above.reason), from_above)
+
+    def make_grasp(
+        self, picked: SceneObject, tool: str, X_OG: RigidTransform
+    ) -> Grasp | PlanningFailure:
+        """Return a given grasp, or why the tool cannot hold the object with it.
+
+        Args:
+            picked: Object at its pose.
+            tool: Name of the tool.
+            X_OG: Pose of the tool in the object.
+        """
+        if failure := self._check_payload(picked):
+            return failure
+        X_TO = rigid_transform(picked.X_TO)
+        grasp = self._gripper.make_grasp(
+            tool, picked.object_class, X_TO, X_TO @ X_OG, self._sampling(UP)
+        )
+        return _to_planning_failure(picked, grasp) if isinstance(grasp, GraspFailure) else grasp
+
+    def _find_grasps(
+        self, picked: SceneObject, normal: Vector
+    ) -> Sequence[Grasp] | PlanningFailure:
+        """Return the feasible grasps of an object, see `grasps`."""
+        if failure := self._check_payload(picked):
+            return failure
+        grasps = self._gripper.sample_grasps(
+            picked.object_class, rigid_transform(picked.X_TO), self._sampling(normal)
+        )
+        return _to_planning_failure(picked, grasps) if isinstance(grasps, GraspFailure) else grasps
+
+    def _sampling(self, normal: Vector) -> GraspSampling:
+        """Return the parameters of the sampling of grasps from a direction."""
+        config = self._config
+        return GraspSampling(
+            config.grasp_spacing,
+            config.lip_gap,
+            config.max_grasps,
+            config.min_payload_acceleration,
+            normal,
+        )
+
+    def _check_payload(self, picked: SceneObject) -> PlanningFailure | None:
+        """Return why gripper and object exceed the payload of the robot, or None."""
+        mass = picked.object_class.mass
+        if mass + self._gripper.mass <= self._payload:
+            return None
+        return PlanningFailure(PlanningFailureReason.TOO_HEAVY, picked.name, mass)
+
+
+def _to_planning_failure(picked: SceneObject, failure: GraspFailure) -> PlanningFailure:
+    """Return the failure of a gripper as one of planning."""
+    reason = PlanningFailureReason(failure.reason.value)
+    return PlanningFailure(reason, picked.name, failure.value)
