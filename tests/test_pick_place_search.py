@@ -15,7 +15,7 @@ from drake_clutter.planning.pick_place_plan import PlanningFailure, PlanningFail
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.pick_place_search import MoveGoal, PickPlaceSearch
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.planning.tool_kinematics import _MAX_POSE_STEP, WayOut
+from drake_clutter.planning.tool_kinematics import _MAX_POSE_STEP, WayOut, raise_pose
 from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.simulation.scene_plant import rigid_transform
 
@@ -136,3 +136,20 @@ def test_a_vertical_carry_is_straight_in_joint_space_where_the_tool_stays_vertic
     assert axes == pytest.approx(np.tile([0.0, 0.0, -1.0], (len(axes), 1)), abs=1e-6)
     assert search.plan_candidate(candidate) is not None
     assert search.num_attempts == 2, "one for the candidate, and one for the first height"
+
+
+def test_optimization_keeps_2_mm_more_from_columns_than_required() -> None:
+    """The box is carried high above the column below its pick pose, far from its axis."""
+    planner, search = search_of([UPPER], "upper")
+    grasps = planner.grasps(UPPER)
+    assert not isinstance(grasps, PlanningFailure)
+    candidate = next(search.ik_candidates(grasps[0]))
+    columns = search._checker.carry_columns(candidate)
+    tool = planner.tools[candidate.tool]
+    X_TG = raise_pose(candidate.X_TG_pick, columns.clearance + 0.01)
+    X_TG[0, 3] += 0.01
+    path = tool.track(np.array([candidate.X_TG_pick, X_TG]), candidate.q_pick)
+    assert path is not None
+    distances = columns.distances(path[-1:])
+    assert distances.slack.min() == pytest.approx(0.01 - 0.002, abs=1e-5)
+    assert columns.slack(path[-1:]) == pytest.approx(0.01, abs=2e-4)

@@ -5,10 +5,12 @@ from typing import Any
 
 import pytest
 from conftest import DEFAULT_CELL
+from PIL import Image
 from test_robot_model import bullet_iiwa, robot, ros_spec, ros_urdf
 
 from drake_clutter.cell.robot_spec import RobotSpec
 from drake_clutter.files import InputError
+from drake_clutter.robots.model_parsing import read_model_text
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.simulation.cell_plant import validate_models
 
@@ -195,3 +197,24 @@ def test_an_arm_without_collision_geometry_is_refused(tmp_path: Path) -> None:
         validate_models(DEFAULT_CELL.model_copy(update={"robot": spec}))
     found = f"robot.model: {spec.model!r}: no link has collision geometry"
     assert str(raised.value) == f"{found}; expected a model with collision geometry"
+
+
+def test_a_damaged_texture_of_a_model_is_refused(tmp_path: Path) -> None:
+    """Where it is rendered; planning reads no visual geometry."""
+    path = tmp_path / "cover.sdf"
+    mesh = "<mesh><uri>cover.obj</uri></mesh>"
+    path.write_text(
+        '<sdf version="1.9"><model name="cover"><link name="cover"><visual name="cover">'
+        f"<geometry>{mesh}</geometry></visual></link></model></sdf>"
+    )
+    faces = "vt 0 0\nvn 0 0 1\nusemtl paint\nf 1/1/1 2/1/1 3/1/1\n"
+    (tmp_path / "cover.obj").write_text(f"mtllib cover.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\n{faces}")
+    (tmp_path / "cover.mtl").write_text("newmtl paint\nmap_Kd paint.png\n")
+    texture = tmp_path / "paint.png"
+    Image.new("RGB", (32, 32), "#804020").save(texture)
+    assert "cover.obj" in read_model_text(path, visuals=True)
+    texture.write_bytes(texture.read_bytes()[:-20])
+    read_model_text.cache_clear()
+    with pytest.raises(InputError, match=r"paint\.png: cannot be read .*; expected an image"):
+        read_model_text(path, visuals=True)
+    assert "cover.obj" not in read_model_text(path, visuals=False)
