@@ -35,7 +35,7 @@ from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.station.motion_recorder import DEFAULT_RATE
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.validation import Count, CountOrZero, NonEmptyText, NonNegative, to_plain
-from training.results_file import ResultsFile, collect_records
+from training.results_file import ResultsFile, Row, collect_records
 from training.script import (
     SCENES,
     ResultsOption,
@@ -110,8 +110,8 @@ class EpisodeReplayer:
         self._rate = rate
         self._seed = seed
 
-    def __call__(self, number: int) -> EpisodeReplays:
-        """Return the replays of an episode.
+    def __call__(self, number: int) -> Row:
+        """Return an `EpisodeReplays` as a dictionary.
 
         Args:
             number: Number of the scene.
@@ -149,7 +149,7 @@ class EpisodeReplayer:
                     object_error=errors.object,
                 )
             )
-        return EpisodeReplays(number=number, replays=tuple(replays))
+        return EpisodeReplays(number=number, replays=tuple(replays)).model_dump(mode="json")
 
 
 def main(
@@ -176,7 +176,7 @@ def main(
     folder.mkdir(parents=True, exist_ok=True)
     replays = list[MoveReplay]()
     num_episodes = 0
-    records = list[dict[str, object]]()
+    records = list[Row]()
     while len(replays) < moves and num_episodes < len(scenes.scenes):
         # An episode has about five executed moves.
         num_episodes += max(1, (moves - len(replays)) // 5)
@@ -206,7 +206,7 @@ def main(
     print_table([{name: str(row[name]) for name in ("moves", "exact", "results", "not_exact")}])
 
 
-def summarize(replays: Sequence[MoveReplay]) -> dict[str, object]:
+def summarize(replays: Sequence[MoveReplay]) -> Row:
     """Return the metrics of replayed moves."""
     num_exact = sum(replay.is_exact for replay in replays)
     joint = np.array([replay.joint_error for replay in replays])

@@ -66,7 +66,11 @@ class _Row(NamedTuple):
     gripper_commanded: Floats
     vacuum: Floats
     X_TG: Floats
-    states: tuple[int, int, int, bool, bool]
+    states: tuple[int, ...]
+
+
+_NO_STATES = (-1, -1, -1, False, False)
+"""`_Row.states` of which no sample takes any."""
 
 
 class MotionRecorder:
@@ -102,13 +106,16 @@ class MotionRecorder:
         self._scene = scene
         self._rate = rate
         self._tool_names = tuple(station.cell.gripper.tools)
+        self._tool_indices = {name: k for k, name in enumerate(self._tool_names)} | {"": -1}
         self._object_indices = {name: k for k, name in enumerate(scene.names)} | {"": -1}
         # They are looked up once: the recorder is called at every step of the plant.
         self._plant_context = station.plant_context(root)
         self._executor_context = executor.GetMyContextFromRoot(root)
         self._command = executor.GetOutputPort("command")
-        self._gripper_command = executor.GetOutputPort("gripper_command")
-        self._hold = executor.GetOutputPort("hold")
+        self._gripper_command: Callable[[], Floats] = lambda: np.zeros(0)
+        if station.cell.gripper.num_actuated_joints:
+            port = executor.GetOutputPort("gripper_command")
+            self._gripper_command = partial(port.Eval, self._executor_context)
         self._torque = station.plant.get_net_actuation_output_port(station.arm.robot)
         self._gripper_state = station.plant.get_state_output_port(station.arm.gripper)
         self._vacuum: Callable[[], Floats] = lambda: np.zeros(0)
@@ -182,8 +189,6 @@ class MotionRecorder:
         command = self._command.Eval(self._executor_context)
         # Before the first step nothing was actuated; at rest, the torque is the commanded one.
         torque = self._torque.Eval(context) if step else command[2 * len(command) // 3 :]
-        hold = self._hold.Eval(self._executor_context).tolist()
-        held = self._gripper.status.held
         return _Row(
             step,
             station.plant.GetPositions(context),
@@ -191,15 +196,24 @@ class MotionRecorder:
             torque,
             command,
             self._gripper_state.Eval(context),
-            self._gripper_command.Eval(self._executor_context),
+            self._gripper_command(),
             self._vacuum(),
             station.arm.tools[self._tool].CalcPoseInWorld(context).GetAsMatrix4(),
-            (
-                hold.index(1.0) if 1.0 in hold else -1,
-                self._object_indices[held],
-                _phase(state, time),
-                *(station.contact_flags(context, held) if has_states else (False, False)),
-            ),
+            self._discrete_states(state, time) if has_states else _NO_STATES,
+        )
+
+    def _discrete_states(self, state: ExecutorState, time: float) -> tuple[int, ...]:
+        """Return `_Row.states`."""
+        held = self._gripper.status.held
+        tool, name = "", "idle"
+        if state.schedule is not None:
+            elapsed = state.elapsed(time)
+            tool, name = state.schedule.tool_at(elapsed), state.schedule.stage_at(elapsed)
+        return (
+            self._tool_indices[tool],
+            self._object_indices[held],
+            phase_index(name),
+            *self._station.contact_flags(self._plant_context, held),
         )
 
     def samples(self, affected: Sequence[Set[str]]) -> ActionSamples:
@@ -266,9 +280,9 @@ class MotionRecorder:
 
     def _executed_commands(self, affected: Sequence[Set[str]]) -> ExecutedCommands:
         """Return the commands, from all states that the executor had."""
-        _, first = self._states[0]
-        assert first.schedule is not None
-        parts = [(0.0, first.schedule)]
+        _, initial = self._states[0]
+        assert initial.schedule is not None
+        parts = [(0.0, initial.schedule)]
         waits = list[float]()
         for (_, earlier), (update, later) in pairwise(self._states):
             assert later.schedule is not None
@@ -280,20 +294,22 @@ class MotionRecorder:
         commands = list[Floats]()
         ends = [*(start for start, _ in parts[1:]), math.inf]
         for (start, schedule), end in zip(parts, ends, strict=True):
-            knots = [time for time in schedule.knots().tolist() if start < time < end]
-            # Commands may jump between two schedules: breaks must increase.
-            knots = [start + 1e-6 if times else 0.0, *knots, *([end] if math.isfinite(end) else [])]
+            # Commands may jump between two schedules: the later one begins 1 us later, because
+            # times must increase.
+            first = start + 1e-6 if times else 0.0
+            inside = [t for t in schedule.knots().tolist() if first + 1e-9 < t < end - 1e-9]
+            knots = [first, *inside, *([end] if math.isfinite(end) else [])]
             times += knots
             commands += [schedule.commands_at(time) for time in knots]
         _, schedule = parts[-1]
-        tools = {name: k for k, name in enumerate(self._tool_names)}
+        steps = schedule.steps
         return ExecutedCommands(
             time=np.array(times),
             command=np.array(commands),
             wait_time=np.array(waits),
             step_start=np.array([*schedule.starts, schedule.end_time]),
-            step_phase=np.array([phase_index(step.name) for step in schedule.steps], np.int16),
-            step_tool=np.array([tools.get(step.tool, -1) for step in schedule.steps], np.int16),
+            step_phase=np.array([phase_index(step.name) for step in steps], np.int16),
+            step_tool=np.array([self._tool_indices[step.tool] for step in steps], np.int16),
             step_affected=np.array(
                 [[name in bodies for name in self._scene.names] for bodies in affected]
             ),
@@ -320,12 +336,6 @@ class MotionRecorder:
             return np.array([*pose.quaternion, *pose.translation])
         start = joint.position_start()
         return positions[:, start : start + len(POSE_COLUMNS)]
-
-
-def _phase(state: ExecutorState, time: float) -> int:
-    """Return the index of the plan's step in `PHASES`; -1 for a step of another name."""
-    name = "idle" if state.schedule is None else state.schedule.stage_at(state.elapsed(time))
-    return phase_index(name)
 
 
 def phase_index(name: str) -> int:
