@@ -112,7 +112,8 @@ TESTS = (
     "shelf",
     "images",
     "image_backend",
-    "hdf5_file",
+    "recorded_episode_file",
+    "episode_recorder",
     "clutter_station",
     "body_sleep",
     "bellows",
@@ -134,6 +135,7 @@ TESTS = (
     "planner_robots",
     "pick_place_planner",
     "pick_place_search",
+    "side_grasps",
     "trajectory_optimization",
 )
 """Test files that reach these modules in their own process."""
