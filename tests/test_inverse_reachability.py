@@ -2,12 +2,14 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import DEFAULT_CELL, cell_with, resting, rng, scene_of
 from numpy.typing import NDArray
+from pydrake.math import RigidTransform
 
 from drake_clutter.feasibility.arm_clearance import (
     ArmGeometry,
@@ -111,7 +113,9 @@ def test_move_poses_follow_the_object() -> None:
     grasps = planner.grasps(can)
     assert not isinstance(grasps, PlanningFailure)
     place = Pose((0.2, 0.1, can.X_TO.p[2] + 0.05), can.X_TO.quaternion)
-    rows = find_move_poses(can, place, [grasps[0]], planner.config)
+    on_axis = DEFAULT_CELL.gripper.tools[grasps[0].tool]
+    tool = replace(on_axis, X_FG=RigidTransform([0.05, 0.0, 0.2]))
+    rows = find_move_poses(can, place, tool, [grasps[0]], planner.config)
     assert rows.shape == (12, 9)
     x, y, _, place_x, place_y, _, z, place_z, top = rows.T
     assert place_x - x == pytest.approx(0.3 * np.ones(12))
@@ -120,8 +124,9 @@ def test_move_poses_follow_the_object() -> None:
     assert top - place_z == pytest.approx(planner.config.lift_height * np.ones(12))
     yaws = np.sort(rows[:, 2] % (2 * math.pi))
     assert np.diff(yaws) == pytest.approx(np.full(11, math.pi / 6))
-    near = [grasps[0], *grasps[:1]]
-    assert len(find_move_poses(can, place, near, planner.config)) == 12, "the same place twice"
+    near = [grasps[0], grasps[0]]
+    assert len(find_move_poses(can, place, tool, near, planner.config)) == 12, "the same place"
+    assert len(find_move_poses(can, place, on_axis, near, planner.config)) == 4
 
 
 class Arm:

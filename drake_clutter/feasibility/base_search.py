@@ -144,7 +144,9 @@ def find_reachable_moves(
         is_reachable = np.zeros(len(grid.bases), bool)
         for name, reachability in maps.items():
             of_tool = [grasp for grasp in grasps if grasp.tool == name]
-            poses = find_move_poses(picked, legal.command.X_TO_place, of_tool, config)
+            poses = find_move_poses(
+                picked, legal.command.X_TO_place, cell.gripper.tools[name], of_tool, config
+            )
             reaches = reachability.find_reachable(
                 MovePoses.join([poses], [indices[picked.name]]),
                 grid.bases,

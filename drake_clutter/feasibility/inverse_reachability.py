@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_clutter.cell.gripper import Grasp
+from drake_clutter.cell.gripper import Grasp, Tool
 from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.compilation import njit
@@ -47,6 +47,8 @@ SPACING = 0.02
 """Spacing of the map in radius and height [m]."""
 NUM_YAWS = 24
 """Number of yaws of the tool relative to the radial direction."""
+NUM_YAWS_ON_AXIS = 4
+"""Number of yaws of a round tool on the flange's axis, about which only the gripper turns."""
 MIN_GRASP_DISTANCE = 0.03
 """Of grasps that are closer to each other, the first stands for the others [m]."""
 _FAR_AWAY = 50.0
@@ -131,14 +133,19 @@ class MovePoses:
 
 
 def find_move_poses(
-    picked: SceneObject, X_TO_place: Pose, grasps: Iterable[Grasp], config: PlannerConfig
+    picked: SceneObject,
+    X_TO_place: Pose,
+    tool: Tool,
+    grasps: Iterable[Grasp],
+    config: PlannerConfig,
 ) -> Floats:
     """Return the poses of a vertical tool through which a move goes.
 
     Args:
         picked: Object to pick.
         X_TO_place: Pose at which it is released.
-        grasps: Its grasps; those with a tilted tool are left out.
+        tool: Tool that holds it.
+        grasps: Its grasps with this tool; those with a tilted tool are left out.
         config: Parameters of the planner.
 
     Returns:
@@ -150,6 +157,7 @@ def find_move_poses(
         rigid_transform(X_TO_place).GetAsMatrix4()
         @ rigid_transform(picked.X_TO).inverse().GetAsMatrix4()
     )
+    is_on_axis = bool(np.allclose(tool.X_FG.translation()[:2], 0.0))
     rows = []
     positions = list[Floats]()
     for grasp in grasps:
@@ -161,7 +169,7 @@ def find_move_poses(
         if any(np.linalg.norm(p_TG - other) < MIN_GRASP_DISTANCE for other in positions):
             continue
         positions.append(p_TG)
-        number = grasp.num_angles or config.num_yaws
+        number = grasp.num_angles or (NUM_YAWS_ON_AXIS if is_on_axis else config.num_yaws)
         turns = np.arange(number) * (2 * math.pi / number)
         heights = X_pick[2, 3], X_place[2, 3], X_pick[2, 3] - bottoms[0] + transfer_bottom
         ends = [
