@@ -3,7 +3,7 @@
 import csv
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import DEFAULT_CELL, ONE_CUP, cell_with, resting, rng, scene_of
+from feasibility_jobs import feasibility_job
 from typer.testing import CliRunner
 
 from drake_clutter.cell.work_cell import WorkCell
@@ -506,6 +507,47 @@ def test_a_study_from_the_command_line(
     result = CliRunner().invoke(app, [*arguments, "--seed", "1"])
     assert isinstance(result.exception, InputError)
     assert "holds results of other options" in str(result.exception)
+
+
+def test_a_killed_study_is_finished_by_any_number_of_processes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is the same, byte by byte, as a study that one process makes in one go."""
+    monkeypatch.setattr(feasibility_run, "write_feasibility_report", lambda *_: None)
+    cells = {"default": DEFAULT_CELL, "small": cell_with(ONE_CUP, "gripper.cup_diameter=0.015")}
+    paths = tmp_path / "can.yaml", tmp_path / "box.yaml"
+    for path, name in zip(paths, ("tomato_soup_can", "pudding_box"), strict=True):
+        scene = scene_of(resting(name))
+        verdict = Verdict(None, scene.poses, dict.fromkeys(scene.names, 1.0), ())
+        save_scene(path, scene, DEFAULT_CELL, verdict)
+    job = replace(
+        feasibility_job(paths[0]),
+        scenes=paths,
+        setups={name: SetupRequest(cell, keep_home=True) for name, cell in cells.items()},
+    )
+
+    def run(name: str, workers: int, num_parts: float) -> dict[str, Any]:
+        """Run a study that is killed after a number of parts."""
+
+        def progress(parts: Iterable[Any], num_done: int, total: int) -> Iterable[Any]:
+            for k, part in enumerate(parts):
+                if total == 4 and num_done + k >= num_parts:
+                    raise KeyboardInterrupt
+                yield part
+
+        return feasibility_run.run_feasibility_study(job, tmp_path / name, workers, progress)
+
+    whole = run("whole", 1, math.inf)
+    with pytest.raises(KeyboardInterrupt):
+        run("killed", 1, 1)
+    assert len([*(tmp_path / "killed" / "parts").glob("moves_*.json")]) == 1
+    assert run("killed", 2, math.inf) == whole
+    summaries = [(tmp_path / name / "summary.json").read_bytes() for name in ("whole", "killed")]
+    assert summaries[0] == summaries[1]
+    tables = [table(tmp_path / name / "moves.csv") for name in ("whole", "killed")]
+    for first, second in zip(*tables, strict=True):
+        assert first | {"planning_s": ""} == second | {"planning_s": ""}
+    assert {setup["possible"] for setup in whole["setups"]} != {0}
 
 
 def test_a_study_of_other_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

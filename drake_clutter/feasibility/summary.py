@@ -158,7 +158,6 @@ def _summarize_setup(
             for group, key in GROUP_KEYS.items()
         },
         "cycle_s": _quantiles(planned, "cycle_s", {"median": 0.5, "p95": 0.95}),
-        "planning_s": _quantiles(possible, "planning_s", {"median": 0.5, "p95": 0.95, "p99": 0.99}),
         "margins": {
             "clearance": _quantiles(planned, "clearance", MARGIN_QUANTILES),
             "joint_margin": _quantiles(planned, "joint_margin", MARGIN_QUANTILES),

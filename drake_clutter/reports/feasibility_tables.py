@@ -68,7 +68,6 @@ def _setup_row(setup: Row, cell: WorkCell, ranking: Sequence[str]) -> dict[str, 
         "share (95 % interval)": _with_interval(setup["share"], setup["share_ci95"]),
         "legal, but impossible": _counts(setup["impossible"]) or "none",
         "cycle time, median": _format(setup["cycle_s"]["median"], 2, " s"),
-        "planning time, median": _format(setup["planning_s"]["median"], 3, " s"),
     }
 
 
