@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -53,6 +54,7 @@ from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import downward_pose
 from drake_clutter.reports import feasibility_cases, feasibility_figures
+from drake_clutter.reports.feasibility_maps import write_interactive_maps
 from drake_clutter.reports.feasibility_report import answer_sentences
 from drake_clutter.resources import resource_path
 from drake_clutter.robots.robot_model import load_robot
@@ -410,6 +412,32 @@ def test_all_moves_are_in_the_plot_over_the_support() -> None:
     (panel, _) = figure.axes
     assert sorted(text.get_text() for text in panel.texts) == ["1", "1"]
     assert panel.images[0].get_extent() == pytest.approx([-0.15, 0.15, -0.5, 0.5])
+
+
+def test_interactive_maps_hold_the_rows(tmp_path: Path) -> None:
+    """Bases in the support have no number; text of the study cannot end the script element."""
+    base = {"settings": "", "z": 0.0, "yaw": math.pi / 2, "possible": 7}
+    bases = [
+        base | {"x": x, "y": y, "reachable": n}
+        for x, y, n in ((0.1, 0.2, 3), (0.1, 0.4, 5), (0.3, 0.4, 7))
+    ]
+    moves = [
+        move_row("a", "</script>", "box", PLANNED),
+        move_row("a", "s", "box", "no seal"),
+        move_row("b", "s", "can", "unreachable"),
+    ]
+    write_interactive_maps(tmp_path, moves, {}, bases, ["a"])
+    page = (tmp_path / "maps.html").read_text()
+    assert page.count("</script>") == page.count("<script") == 3
+    (source,) = re.findall(r'src="(.*?)"', page)
+    assert "Plotly" in (tmp_path / source).read_text()
+    data = json.loads(page.partition('type="application/json">')[2].partition("</script>")[0])
+    (grid,) = data["bases"]
+    assert (grid["x"], grid["y"], grid["yaw_deg"]) == ([0.1, 0.3], [0.2, 0.4], [90.0])
+    assert grid["reachable"] == [[[[3, 5], [None, 7]]]]
+    ((move,),) = [of_setup["rows"] for of_setup in data["moves"]]
+    assert move["pick"] == [moves[0]["pick_x"], moves[0]["pick_y"]]
+    assert move["text"].startswith("&lt;/script&gt;: box to tray<br>planned")
 
 
 def test_another_base_keeps_the_roll_and_pitch_of_the_cell() -> None:

@@ -26,6 +26,11 @@ from drake_clutter.reports.feasibility_figures import (
     plot_ranking,
     plot_reachability,
 )
+from drake_clutter.reports.feasibility_maps import (
+    MAPS_FILE,
+    can_write_maps,
+    write_interactive_maps,
+)
 from drake_clutter.reports.feasibility_tables import (
     comparisons_table,
     margins_table,
@@ -78,7 +83,7 @@ class StudyResults:
 def write_feasibility_report(
     path: Path, results: StudyResults, load_scene: Callable[[str], Scene]
 ) -> None:
-    """Write the page of a feasibility study.
+    """Write the page of a feasibility study and, with the extra `data`, interactive maps beside it.
 
     Args:
         path: HTML file.
@@ -88,6 +93,9 @@ def write_feasibility_report(
     with rc_context(PLOT_STYLE):
         parts = [*_summary_parts(results), *_figure_parts(results)]
     parts += _case_parts(results, load_scene)
+    shown = results.summary["ranking"][:MAX_PANELS]
+    if shown and can_write_maps():
+        write_interactive_maps(path.parent, results.moves, results.maps, results.bases, shown)
     page = (
         '<!doctype html><html lang="en"><meta charset="utf-8"><title>Kinematic feasibility</title>'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -150,6 +158,8 @@ def _summary_parts(results: StudyResults) -> Iterable[str]:
         "on top, a tool holds it, and there is a free place. All shares are of the possible moves. "
         "Intervals take the scenes as the sample.</p>"
     )
+    if summary["ranking"] and can_write_maps():
+        yield f'<p>To look closer: <a href="{MAPS_FILE}">interactive maps</a>.</p>'
     yield setups_table(summary, results.setups)
     if summary["unstable_scenes"]:
         excluded = escape(", ".join(summary["unstable_scenes"]))
