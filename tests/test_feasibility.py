@@ -346,11 +346,12 @@ def test_a_summary_is_of_the_possible_moves() -> None:
         "a": [PLANNED, PLANNED, "unreachable", "no seal"],
         "b": [PLANNED, "unreachable", "unreachable", PLANNED],
     }
+    cycles = {"a": (5.0, 3.0, None, None), "b": (4.0, None, None, math.nan)}
     row = move_row("a", "0", "0", PLANNED)
     moves = [
         row
         | {"setup": setup, "scene": str(k % 2), "pick": str(k), "result": result}
-        | {"possible": result != "no seal"}
+        | {"possible": result != "no seal", "cycle_s": cycles[setup][k]}
         for setup, found in results.items()
         for k, result in enumerate(found)
     ]
@@ -366,6 +367,8 @@ def test_a_summary_is_of_the_possible_moves() -> None:
     assert (a["impossible"], a["failures"]) == ({"no seal": 1}, {"unreachable": 1})
     assert (b["possible"], b["planned"], b["share"]) == (4, 2, 0.5)
     assert c["unusable"] == "no home"
+    assert a["cycle_s"] == {"median": 3.0, "p95": 3.0}
+    assert b["cycle_s"] == {"median": 4.0, "p95": 4.0}, "of the motions that are optimized"
     assert summary["ranking"] == ["a", "b"]
     (comparison,) = summary["comparisons"]
     assert comparison["possible_in_both"] == 3

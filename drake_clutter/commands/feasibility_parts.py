@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Strict, create_model, model_validator
 
 from drake_clutter.catalog import load_catalog
+from drake_clutter.cell.camera import Camera
 from drake_clutter.commands.feasibility_job import FeasibilityJob
 from drake_clutter.feasibility.base_search import BaseGrid, find_reachable_moves, make_base_grids
 from drake_clutter.feasibility.home_search import Home
@@ -21,7 +22,13 @@ from drake_clutter.feasibility.inverse_reachability import (
     load_inverse_reachability,
     save_inverse_reachability,
 )
-from drake_clutter.feasibility.move_study import FeasibilityStudy, MoveRecord, find_legal_moves
+from drake_clutter.feasibility.move_study import (
+    MAX_OPTIMIZED_MOVES,
+    FeasibilityStudy,
+    LegalMove,
+    MoveRecord,
+    find_legal_moves,
+)
 from drake_clutter.feasibility.pose_noise import NoiseRecord, NoiseStudy
 from drake_clutter.feasibility.reach_map import TILTS_DEG, ReachabilityAnalysis
 from drake_clutter.feasibility.sequences import SequenceRecord, search_scene
@@ -43,6 +50,9 @@ from drake_clutter.validation import (
     validate,
 )
 
+NUM_OPTIMIZED_MOVES = 100
+"""Number of moves of a setup whose motions are optimized, at most `MAX_OPTIMIZED_MOVES` of a scene
+and at least one: the cycle time of a move takes three times as long as its plan."""
 MAP_HEIGHTS = (0.05, 0.20, 0.35, 0.50)
 """Heights of the reachability maps above the floor of the support [m]."""
 MAP_SPACING = 0.1
@@ -109,9 +119,9 @@ class FeasibilityWorker:
         self._folder = folder
         self._studies: dict[int, FeasibilityStudy] = {}
         self._load_scene = cache(lambda index: load_settled_scene(job.scenes[index], job))
+        self._legal_moves = cache(self._find_legal_moves)  # the same for all arms
         self._grids = cache(lambda: make_base_grids(job.reference, job.searches))
         self._maps = cache(self._load_maps)
-        self._detector = LabelDetector(job.reference.camera)
 
     def __call__(self, part: StudyPart) -> dict[str, Any]:
         """Return the result of a part as a JSON document."""
@@ -148,6 +158,12 @@ class FeasibilityWorker:
         )
         return found | {"sequence": asdict(record)}
 
+    def _find_legal_moves(self, scene_index: int, camera: Camera) -> tuple[LegalMove, ...]:
+        scene: Scene | None = self._load_scene(scene_index)
+        assert scene is not None, "moves exist only for stable scenes"
+        detector = LabelDetector(camera)
+        return find_legal_moves(scene, detector, self._job.config, self._job.seed, scene_index)
+
     def _build_maps(self, index: int) -> dict[str, Any]:
         grid: BaseGrid = self._grids()[index]
         for tool in grid.cell.gripper.tools:
@@ -166,9 +182,8 @@ class FeasibilityWorker:
     def _count_reachable(self, part: StudyPart, scene: Scene) -> dict[str, Any]:
         assert part.scene_index is not None
         grid: BaseGrid = self._grids()[part.index]
-        config = replace(self._job.config, cell=grid.cell)
-        moves = find_legal_moves(scene, self._detector, config, self._job.seed, part.scene_index)
-        found = find_reachable_moves(grid, self._maps(part.index), scene, moves)
+        legal = self._legal_moves(part.scene_index, grid.cell.camera)
+        found = find_reachable_moves(grid, self._maps(part.index), scene, legal)
         possible = [reaches for reaches in found if reaches is not None]
         counts = np.sum(possible, axis=0, dtype=int) + np.zeros(len(grid.bases), int)
         return {"possible": len(possible), "reachable": counts.tolist()}
@@ -210,11 +225,19 @@ class FeasibilityWorker:
         if part.index not in self._studies:
             # One study at a time: its planner holds a collision model.
             self._studies = {part.index: FeasibilityStudy(setup.name, config, self._job.seed)}
-        moves = self._studies[part.index].plan_all_moves(name, part.scene_index, scene)
+        legal = self._legal_moves(part.scene_index, setup.cell.camera)
+        moves = self._studies[part.index].plan_moves(
+            name, part.scene_index, scene, legal, max_optimized_moves(len(self._job.scenes))
+        )
         noise = NoiseStudy(setup.name, config, self._job.seed).simulate_moves(
             name, part.scene_index, scene, moves, self._job.noisy_moves
         )
         return {"moves": [asdict(row) for row in moves], "noise": [asdict(row) for row in noise]}
+
+
+def max_optimized_moves(num_scenes: int) -> int:
+    """Return the number of moves of a scene whose motions are optimized, for their cycle times."""
+    return max(1, min(MAX_OPTIMIZED_MOVES, -(-NUM_OPTIMIZED_MOVES // num_scenes)))
 
 
 def load_settled_scene(path: Path, job: FeasibilityJob) -> Scene | None:

@@ -79,7 +79,7 @@ class MoveRecord:
         failure_value: Quantity that the failure refers to [m, kg or s]; NaN without one.
         planning_s: Planning time [s].
         cycle_s: Duration of the optimized motion from home to home with the dwells of the gripper
-            [s]; NaN for moves beyond the first `MAX_OPTIMIZED_MOVES` of a random order.
+            [s]; NaN for moves beyond the first of a random order.
         unoptimized_s: Duration of the motion before trajectory optimization, likewise [s].
         num_attempts: Number of candidates (grasps and IK solutions) that were checked.
         clearance: Smallest distance between two bodies on the path [m]; infinite if all are above
@@ -170,7 +170,7 @@ class FeasibilityStudy:
         self._planners: dict[bool, PickPlacePlanner] = {}
 
     def plan_all_moves(self, name: str, index: int, scene: Scene) -> list[MoveRecord]:
-        """Plan every legal move in a scene.
+        """Plan every legal move in a scene; of a few, the motions are optimized.
 
         Args:
             name: Name of the scene in the records.
@@ -178,10 +178,24 @@ class FeasibilityStudy:
             scene: The scene, at rest.
         """
         legal = find_legal_moves(scene, self._detector, self._config, self._seed, index)
+        return self.plan_moves(name, index, scene, legal, MAX_OPTIMIZED_MOVES)
+
+    def plan_moves(
+        self, name: str, index: int, scene: Scene, legal: Sequence[LegalMove], num_optimized: int
+    ) -> list[MoveRecord]:
+        """Plan legal moves of a scene.
+
+        Args:
+            name: Name of the scene in the records.
+            index: Index of the scene.
+            scene: The scene, at rest.
+            legal: The moves.
+            num_optimized: Largest number of moves whose motions are optimized.
+        """
         records = [self._plan_move(name, scene, move) for move in legal]
         # The same moves in every setup in which the same moves are possible.
         order = item_rng(self._seed, index, len(legal)).permutation(len(legal)).tolist()
-        for k in [k for k in order if records[k].possible][:MAX_OPTIMIZED_MOVES]:
+        for k in [k for k in order if records[k].possible][:num_optimized]:
             if records[k].result == PLANNED:
                 records[k] = replace(records[k], cycle_s=self._cycle_time(scene, legal[k]))
         return records

@@ -137,6 +137,8 @@ def _summarize_setup(
     """Return the statistics of one setup from its rows."""
     possible = [row for row in moves if row["possible"]]
     planned = [row for row in possible if row["result"] == PLANNED]
+    # Only some of the motions are optimized.
+    optimized = [row for row in planned if math.isfinite(row["cycle_s"] or math.nan)]
     return {
         "name": setup.name,
         "unusable": setup.reason if isinstance(setup, UnusableSetup) else None,
@@ -157,7 +159,7 @@ def _summarize_setup(
             }
             for group, key in GROUP_KEYS.items()
         },
-        "cycle_s": _quantiles(planned, "cycle_s", {"median": 0.5, "p95": 0.95}),
+        "cycle_s": _quantiles(optimized, "cycle_s", {"median": 0.5, "p95": 0.95}),
         "margins": {
             "clearance": _quantiles(planned, "clearance", MARGIN_QUANTILES),
             "joint_margin": _quantiles(planned, "joint_margin", MARGIN_QUANTILES),
