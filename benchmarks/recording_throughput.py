@@ -88,12 +88,11 @@ def time_dataset(job: RecordingJob, episodes: int, workers: int) -> Timing:
     """Record a data set and return its times."""
     arrivals = list[tuple[float, int]]()
 
-    def watch(
-        new_episodes: Iterable[EpisodeSummary], num_done: int, total: int
-    ) -> Iterator[EpisodeSummary]:
-        for episode in new_episodes:
-            arrivals.append((time.perf_counter(), episode.num_executed))
-            yield episode
+    def watch(label: str, items: Iterable[Any], num_done: int, total: int) -> Iterator[Any]:
+        for item in items:
+            if isinstance(item, EpisodeSummary):
+                arrivals.append((time.perf_counter(), item.num_executed))
+            yield item
 
     begin = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:

@@ -118,20 +118,25 @@ def test_a_missing_episode_is_recorded_again_with_the_same_bytes(
     second.unlink()
     (second.parent / f".{second.stem}.tmp-00000000.h5").write_bytes(before[:1000])
     done = list[EpisodeSummary]()
+    labels = list[str]()
 
-    def progress(episodes: Any, num_done: int, total: int) -> Any:
-        assert (num_done, total) == (1, 2)
-        for episode in episodes:
-            done.append(episode)
-            yield episode
+    def progress(label: str, items: Any, num_done: int, total: int) -> Any:
+        labels.append(label)
+        assert (num_done, total) == (1 if label == "episodes" else 0, 2)
+        for item in items:
+            done.extend([item] if label == "episodes" else [])
+            yield item
 
     summary = record_dataset(job, 2, [], dataset, progress=progress)
+    assert labels == ["episodes", "episodes in the card"]
     assert [episode.index for episode in done] == [1]
     assert done[0].num_executed == 1
     # The worker has recorded no other episode before: nothing depends on what it did.
     assert second.read_bytes() == before
     assert first.stat().st_mtime_ns == time
     assert summary["executed_moves"] == 2
+    card = (dataset / "README.md").read_text()
+    assert "# Moves of moves in scenes0" in card
     assert sorted(p.name for p in second.parent.iterdir()) == [first.name, second.name]
 
 
@@ -144,6 +149,8 @@ def test_a_policy_that_raises_ends_only_its_episodes(scenes: FileScenes, tmp_pat
     assert load_episode(episode_path(tmp_path, 3), CATALOG).error == message
     document = json.loads((tmp_path / "job.json").read_text())
     assert document["policy"] == "pick_can_or_refuse"
+    with pytest.raises(InputError, match=r"--episodes 3: .* holds 4; expected at least as many"):
+        record_dataset(job, 3, [], tmp_path)
     # A longer data set keeps the episodes.
     assert record_dataset(job, 5, [], tmp_path)["episodes"] == 5
 

@@ -19,13 +19,12 @@ import typer
 from drake_clutter.commands.episode_scenes import find_scenes
 from drake_clutter.commands.record_dataset import (
     CameraOptions,
-    EpisodeSummary,
     RecordingJob,
     record_dataset,
 )
 from drake_clutter.config import load_config
 from drake_clutter.reports.dataset_card import CARD_FILE, CONTACT_SHEET_FILE, FIGURES_FILE
-from training.script import SeedOption, WorkersOption, progress, run_script
+from training.script import Item, SeedOption, WorkersOption, progress, run_script
 
 SCENES = "sg_star_25"
 POLICY = "random"
@@ -58,10 +57,8 @@ def main(
         cameras=CAMERAS,
     )
 
-    def show(
-        episodes: Iterable[EpisodeSummary], num_done: int, total: int
-    ) -> Iterable[EpisodeSummary]:
-        return progress(episodes, "episodes", total, num_done)
+    def show(label: str, items: Iterable[Item], num_done: int, total: int) -> Iterable[Item]:
+        return progress(items, label, total, num_done)
 
     episodes = math.ceil(moves / MAX_MOVES)
     while True:

@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterable
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -24,12 +24,9 @@ from drake_clutter.cli.options import (
     SetOption,
     WorkersOption,
 )
-from drake_clutter.cli.output import err_console, print_result, progress_bar
+from drake_clutter.cli.output import Item, err_console, print_result, progress_bar
 from drake_clutter.files import InputError
 from drake_clutter.limits import MAX_COUNT, MAX_IMAGE_SIDE, MAX_SAMPLE_RATE
-
-if TYPE_CHECKING:
-    from drake_clutter.commands.record_dataset import EpisodeSummary
 
 _MIN_IMAGE_SIDE = 16
 _OPTIONS_OF_A_RUN = ("out", "workers", "ray", "as_json")
@@ -148,7 +145,12 @@ def record(
     """
     from drake_clutter.commands.episode_scenes import FileScenes, find_scenes
     from drake_clutter.commands.explore_scene import read_moves
-    from drake_clutter.commands.record_dataset import CameraOptions, RecordingJob, record_dataset
+    from drake_clutter.commands.record_dataset import (
+        CameraOptions,
+        EpisodeSummary,
+        RecordingJob,
+        record_dataset,
+    )
     from drake_clutter.recording.camera_recorder import CameraChannel
     from drake_clutter.recording.formats.dataset_format import DatasetFormat
     from drake_clutter.recording.randomization import load_randomization
@@ -182,15 +184,15 @@ def record(
     start = time.monotonic()
     executed = 0
 
-    def moves_per_hour(episode: "EpisodeSummary") -> str:
+    def moves_per_hour(item: object) -> str:
         nonlocal executed
-        executed += episode.num_executed
+        if not isinstance(item, EpisodeSummary):
+            return ""
+        executed += item.num_executed
         return f"{3600 * executed / (time.monotonic() - start):,.0f} moves/h"
 
-    def progress(
-        new_episodes: Iterable["EpisodeSummary"], num_done: int, total: int
-    ) -> Iterable["EpisodeSummary"]:
-        return progress_bar("episodes", new_episodes, num_done, total, moves_per_hour)
+    def progress(label: str, items: Iterable[Item], num_done: int, total: int) -> Iterable[Item]:
+        return progress_bar(label, items, num_done, total, moves_per_hour)
 
     formats = [DatasetFormat(name.value) for name in format or ()]
     summary = record_dataset(

@@ -6,11 +6,11 @@ an episode depends only on the job and on its number, not on the number of worke
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import h5py
 import numpy as np
@@ -26,7 +26,7 @@ from drake_clutter.commands.episode_scenes import SceneSource
 from drake_clutter.commands.explore_scene import move_list_policy
 from drake_clutter.commands.job_file import open_job_folder
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import reading_file, write_json
+from drake_clutter.files import InputError, reading_file, write_json
 from drake_clutter.learning.pretrained import checkpoint_sha256
 from drake_clutter.recording.appearance import NUM_LIGHTS, colored_parts
 from drake_clutter.recording.camera_recorder import (
@@ -59,6 +59,8 @@ from drake_clutter.station.motion_recorder import DEFAULT_RATE
 from drake_clutter.tasks.belief import Policy
 from drake_clutter.validation import to_plain
 from drake_clutter.workers.parallel_map import map_ordered
+
+Item = TypeVar("Item")
 
 EPISODES_FOLDER = "episodes"
 """Folder of the recorded episodes in that of a data set."""
@@ -312,8 +314,24 @@ class EpisodeWriter:
         save_episode(path, episode, record_images=record_images)
 
 
-Progress = Callable[[Iterable[EpisodeSummary], int, int], Iterable[EpisodeSummary]]
-"""Wraps the new episodes, given the number of existing episodes and of all episodes."""
+class Progress(Protocol):
+    """Shows the progress of a part of the work."""
+
+    def __call__(
+        self, label: str, items: Iterable[Item], num_done: int, total: int, /
+    ) -> Iterable[Item]:
+        """Return the items of a part while they are counted.
+
+        Args:
+            label: What is counted.
+            items: The items.
+            num_done: Number of items that an earlier run has finished.
+            total: Number of items, including those.
+        """
+
+
+def _show_nothing(label: str, items: Iterable[Item], num_done: int, total: int) -> Iterable[Item]:
+    return items
 
 
 def record_dataset(
@@ -326,7 +344,7 @@ def record_dataset(
     license: str = "",
     workers: int = 1,
     ray_address: str | None = None,
-    progress: Progress = lambda episodes, num_done, total: episodes,
+    progress: Progress = _show_nothing,
 ) -> dict[str, Any]:
     """Record a data set, or go on with an interrupted or shorter one of the same job.
 
@@ -342,35 +360,51 @@ def record_dataset(
         license: SPDX identifier of the data's license, for its card; "" if none is chosen.
         workers: Number of worker processes.
         ray_address: Address of the Ray cluster that runs the workers; None runs them locally.
-        progress: Wraps the new episodes.
+        progress: Shows the progress of recording, whose items are `EpisodeSummary`, of conversion
+            and of the card.
 
     Returns:
         The summary, the content of `summary.json`.
 
     Raises:
         InputError: The policy or a camera does not exist, a package that a format needs is missing,
-            or the folder holds another data set.
+            or the folder holds another data set or more episodes.
     """
     job.check()
     for dataset_format in formats:
         check_format(dataset_format)
     with open_job_folder(out, job.to_dict()):
         (out / EPISODES_FOLDER).mkdir(exist_ok=True)
+        num_files = len(list((out / EPISODES_FOLDER).glob("episode_*.h5")))
+        if num_files > num_episodes:
+            raise InputError(
+                f"--episodes {num_episodes}: {out} holds {num_files}; expected at least as many"
+            )
         paths = [episode_path(out, index) for index in range(num_episodes)]
         missing = [index for index, path in enumerate(paths) if not path.exists()]
         new_episodes = map_ordered(
             partial(EpisodeWriter, job, out), missing, workers=workers, ray_address=ray_address
         )
-        for _ in progress(new_episodes, num_episodes - len(missing), num_episodes):
+        num_done = num_episodes - len(missing)
+        for _ in progress("episodes", new_episodes, num_done, num_episodes):
             pass
         catalog = load_catalog(job.catalog_folder)
         for dataset_format in formats:
-            episodes = (load_episode(path, catalog) for path in paths)
-            convert_episodes(dataset_format, episodes, out)
+            if dataset_format is not DatasetFormat.HDF5:
+                label = f"episodes as {dataset_format.value}"
+                shown_paths = progress(label, paths, 0, num_episodes)
+                episodes = (load_episode(path, catalog) for path in shown_paths)
+                convert_episodes(dataset_format, episodes, out)
         summary = summarize_dataset([read_summary(path) for path in paths])
         title = f"Moves of {job.policy_name} in {job.scenes.name}"
         text = CardText(title, command or "drake_clutter.record_dataset(...)", license)
-        write_card(out, catalog, formats, text)
+        write_card(
+            out,
+            catalog,
+            formats,
+            text,
+            progress=lambda files: progress("episodes in the card", files, 0, num_episodes),
+        )
         write_json(out / SUMMARY_FILE, summary)
     return summary
 

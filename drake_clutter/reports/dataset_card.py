@@ -1,7 +1,7 @@
 """Card of a recorded data set: README.md, a contact sheet and figures."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -70,7 +70,12 @@ class CardText:
 
 
 def write_card(
-    out: Path, catalog: Catalog, formats: Sequence[DatasetFormat], text: CardText
+    out: Path,
+    catalog: Catalog,
+    formats: Sequence[DatasetFormat],
+    text: CardText,
+    *,
+    progress: Callable[[Iterable[Path]], Iterable[Path]] = iter,
 ) -> None:
     """Write README.md, contact sheet and figures of a data set.
 
@@ -79,13 +84,14 @@ def write_card(
         catalog: Catalog with the classes of the objects.
         formats: Formats in which it was written besides HDF5.
         text: Title, command and license.
+        progress: Wraps the files, which are read one after the other.
     """
     files = find_episode_files(out)
     episodes = list[EpisodeFigures]()
     thumbnails = list[tuple[NDArray[np.uint8], str, bool]]()
     chosen = np.linspace(0, len(files) - 1, min(len(files), NUM_THUMBNAILS)).round()
     shown = set(chosen.astype(int).tolist())
-    for index, file in enumerate(files):
+    for index, file in enumerate(progress(files)):
         episode = load_episode(file, catalog, images=index in shown)
         episodes.append(summarize_episode(episode, file.name))
         if index in shown and (thumbnail := _thumbnail(episode)) is not None:
