@@ -3,6 +3,7 @@
 Frames: W is the world, C the camera, whose axes are those of W in most tests.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -162,6 +163,22 @@ def test_texture_is_perspective_correct_and_depth_that_of_a_tilted_plane() -> No
     value = np.clip(share[interior] * 256 - 0.5, 0, 255) / 255
     decoded = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
     assert linear(images.color[interior])[:, 0] == pytest.approx(decoded, abs=0.012)
+
+
+def test_a_texture_repeats_beyond_its_edges() -> None:
+    """A ramp that is shown twice: the gray of a pixel returns after half of the square."""
+    camera = camera_of(64, 64)
+    half = 24 / camera.focal_length
+    ramp = np.linspace(100, 160, 16).astype(np.uint8)[None, :, None].repeat(3, axis=2)
+    square = quad(facing_square(half, 1.0), texture=ramp)
+    twice = replace(square, uv=square.uv * np.array([2.0, 1.0]))
+    row = MeshRenderer([twice]).render(camera, IDENTITY, instances_of(0), AMBIENT).color[31, :, 0]
+    first = int(camera.principal_point[0]) - 24
+    assert np.array_equal(row[first + 3 : first + 21], row[first + 27 : first + 45])
+    assert np.all(np.diff(row[first + 3 : first + 21].astype(int)) > 0)
+    # Shown once, it rises from edge to edge.
+    once = MeshRenderer([square]).render(camera, IDENTITY, instances_of(0), AMBIENT).color[31, :, 0]
+    assert np.all(np.diff(once[first + 3 : first + 45].astype(int)) >= 0)
 
 
 def test_a_floor_that_reaches_behind_the_camera() -> None:
