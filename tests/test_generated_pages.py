@@ -25,6 +25,7 @@ import results_judge_agreement
 import results_mutation
 import results_negative
 import results_perception
+import results_rendering
 from markdown_text import estimate, number, table
 from results_files import with_current_keys
 
@@ -44,6 +45,7 @@ RESULTS = {
         results_mutation,
         results_negative,
         results_perception,
+        results_rendering,
     )
 }
 FILE = re.compile(r"`((?:training|benchmarks)/[\w./-]+)`")

@@ -25,6 +25,7 @@ import results_judge_agreement
 import results_mutation
 import results_negative
 import results_perception
+import results_rendering
 
 PAGES: Mapping[str, Callable[[], str]] = {
     "reference/api.md": api_page.page,
@@ -37,6 +38,7 @@ PAGES: Mapping[str, Callable[[], str]] = {
     "results/closed_loop.md": results_closed_loop.page,
     "results/arm.md": results_arm.page,
     "results/perception.md": results_perception.page,
+    "results/rendering.md": results_rendering.page,
     "results/judge_agreement.md": results_judge_agreement.page,
     "results/calibration.md": results_calibration.page,
     "results/intervals.md": results_intervals.page,

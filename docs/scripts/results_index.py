@@ -13,6 +13,7 @@ PAGES = (
     ("closed_loop.md", "Closed loop", "Success rates with images and the arm"),
     ("arm.md", "Arm", "Planning and execution of pick-and-place moves"),
     ("perception.md", "Perception", "Recall and accuracy of the trained detectors"),
+    ("rendering.md", "Rendering", "Compiled renderer compared with Drake's"),
     ("judge_agreement.md", "Judge agreement", "Static stability judge compared with Drake; speed"),
     ("calibration.md", "Calibration", "Random scenes compared with the paper's"),
     ("intervals.md", "Confidence intervals", "Methods, and their coverage for few values"),
