@@ -156,6 +156,12 @@ def read_tree(out: Path) -> Tree:
             with path.open() as file:
                 rows = [row | {"planning_s": ""} for row in csv.DictReader(file)]
             tree[str(path.relative_to(out))] = json.dumps(rows)
+        elif path.is_file() and path.suffix == ".parquet":
+            from pyarrow import parquet  # which has written the file
+
+            table = parquet.read_table(path)
+            rows = [row | {"planning_s": ""} for row in table.to_pylist()]
+            tree[str(path.relative_to(out))] = json.dumps(rows)
         elif path.is_file() and path.suffix in (".json", ".html"):
             text = path.read_text().replace(str(out), "OUT")
             tree[str(path.relative_to(out))] = WALL_TIMES.sub(r"\g<key>", text)
