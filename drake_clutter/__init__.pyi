@@ -93,6 +93,10 @@ from .feasibility.move_study import FeasibilityStudy as FeasibilityStudy
 
 # Recorded episodes.
 from .recording.episode_recorder import record_episode as record_episode
+from .recording.exact_replay import (
+    compare_samples as compare_samples,
+    replay_action as replay_action,
+)
 from .recording.hdf5_file import load_episode as load_episode, save_episode as save_episode
 from .recording.recorded_episode import (
     RecordedAction as RecordedAction,

@@ -7,6 +7,7 @@ import pytest
 from conftest import DEFAULT_CELL, cell_with, resting, scene_of
 
 from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.config import SettleConfig
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
@@ -78,3 +79,19 @@ def test_errors_are_those_of_the_worst_joint_and_object() -> None:
     assert not errors.is_exact
     with pytest.raises(InputError, match="no executed commands; expected a recording of version 2"):
         replay(DEFAULT_CELL, replace(samples, executed=None))
+
+
+def test_a_collapse_is_replayed() -> None:
+    """The plan does not know of the box at its place, and collides with it."""
+    box, unknown = SCENE["sugar_box"], resting("cracker_box", xy=(0.2, -0.2))
+    scene = scene_of(box, unknown)
+    place = Pose((0.2, -0.21, box.X_TO.translation[2]), box.X_TO.quaternion)
+    plan = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(optimize=False)).plan(
+        [box], box.name, place
+    )
+    assert isinstance(plan, PickPlacePlan)
+    result = StationSimulation(DEFAULT_CELL, scene, rate=100.0).execute(plan)
+    assert result.displacements[unknown.name] > SettleConfig().max_displacement
+    assert result.samples is not None
+    errors = compare_samples(result.samples, replay(DEFAULT_CELL, result.samples, scene))
+    assert (errors.joint, errors.object) == (0.0, 0.0)
