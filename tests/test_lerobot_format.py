@@ -1,6 +1,7 @@
 """LeRobot data sets: layout and numbers, read with pyarrow and PyAV, and with LeRobot itself."""
 
 import json
+from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -196,3 +197,21 @@ def test_lerobot_reads_the_data_set(
     item = windows[ROWS - 1]
     assert item["action"].shape == (2, 8)
     assert item["action_is_pad"].tolist() == [False, True]
+
+
+def test_rerun_reads_the_data_set(dataset: Path, episodes: list[RecordedEpisode]) -> None:
+    """A reader of LeRobot data sets that the locked environment has."""
+    from rerun.experimental import LeRobotReader
+
+    reader = LeRobotReader(str(dataset))
+    assert reader.version == "v3"
+    rows = defaultdict(list)
+    for chunk in reader.stream(3):
+        if not chunk.is_static:
+            rows[str(chunk.entity_path)] += chunk.to_record_batch().to_pylist()
+    samples = episodes[1].actions[2].samples
+    assert samples is not None
+    states = sorted(rows["/observation.state"], key=lambda row: row["frame_index"])
+    q = np.array([row["Scalars:scalars"][:6] for row in states])
+    assert q == pytest.approx(samples.q[::2], abs=1e-6)
+    assert {row["TextDocument:text"][0] for row in rows["/task"]} == {"pudding_box onto tray"}
