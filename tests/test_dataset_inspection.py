@@ -240,6 +240,7 @@ def test_the_card_states_counts_results_and_origin(dataset: Path) -> None:
     for row in (
         "| attempted moves | 6 |",
         "| executed moves | 4 |",
+        "| recorded motion | 0.1 min, 164 samples |",
         "| placed | 2 (33.3 %; 95 % interval 9.7 to 70.0 %) |",
         "| images | overhead: 42 |",
         "| seed | 7 |",

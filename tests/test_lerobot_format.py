@@ -205,7 +205,7 @@ def test_rerun_reads_the_data_set(dataset: Path, episodes: list[RecordedEpisode]
 
     reader = LeRobotReader(str(dataset))
     assert reader.version == "v3"
-    rows = defaultdict(list)
+    rows: defaultdict[str, list[dict[str, Any]]] = defaultdict(list)
     for chunk in reader.stream(3):
         if not chunk.is_static:
             rows[str(chunk.entity_path)] += chunk.to_record_batch().to_pylist()

@@ -164,7 +164,7 @@ def _card(
         "executed moves": f"{len(found)}",
         "placed": f"{placed} ({_percent(placed, len(rows))}; 95 % interval "
         f"{100 * low:.1f} to {100 * high:.1f} %)",
-        "recorded motion": f"{seconds / 3600:.2f} h, {sum(r.num_samples for r in found)} samples",
+        "recorded motion": f"{seconds / 60:.1f} min, {sum(r.num_samples for r in found)} samples",
         "rate": _list(f"{rate:g} Hz" for rate in sorted({e.rate for e in episodes})),
         "images": _list(f"{name}: {number}" for name, number in images.items()) or "none",
         "robot": _list(sorted({e.robot for e in episodes})),
