@@ -17,7 +17,7 @@ PAGES = (
     ("judge_agreement.md", "Judge agreement", "Static stability judge compared with Drake; speed"),
     ("calibration.md", "Calibration", "Random scenes compared with the paper's"),
     ("intervals.md", "Confidence intervals", "Methods, and their coverage for few values"),
-    ("export.md", "Exported scenes", "Stable scenes in MuJoCo and PyBullet"),
+    ("export.md", "Exported scenes", "Stable scenes and recorded motions in other simulators"),
     ("mutation_testing.md", "Mutation testing", "Small faults of the code that the tests catch"),
     ("negative_results.md", "Negative results", "What did not help"),
 )
