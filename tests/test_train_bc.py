@@ -23,7 +23,7 @@ from training.train_bc import (
     StateSampler,
     ToolKinematics,
     crop_image,
-    object_top,
+    object_target,
     play,
     read_demonstrations,
     split,
@@ -52,7 +52,7 @@ def demonstrations() -> list[Demonstration]:
                 tool="large",
                 time=time - time[0],
                 q=np.array([approach.value(t).ravel() for t in time]),
-                target=object_top(scene_of(box), "sugar_box"),
+                target=object_target(scene_of(box), "sugar_box"),
                 image=None,
             )
         )
@@ -61,9 +61,9 @@ def demonstrations() -> list[Demonstration]:
 
 def test_demonstrations_end_at_their_target(demonstrations: list[Demonstration]) -> None:
     for d, xy in zip(demonstrations, PLACES, strict=True):
-        assert d.target == pytest.approx([*xy, 0.038], abs=1e-9)
+        assert d.target == pytest.approx([*xy, 0.038, 0.0], abs=1e-9)
         p_TG, axis = ToolKinematics(d.cell, d.tool).pose(d.q[-1])
-        assert p_TG == pytest.approx(d.target, abs=0.002)
+        assert p_TG == pytest.approx(d.target[:3], abs=0.002)
         assert axis == pytest.approx([0, 0, -1], abs=1e-3)
 
 
@@ -129,9 +129,15 @@ def test_target_from_the_depth_image() -> None:
     with torch.inference_mode():
         first, second = policy.find_target(torch.from_numpy(np.stack([image, shifted])))
     points = image[:3, image[3] > 0]
-    assert (first.numpy() >= points.min(axis=1)).all()
-    assert (first.numpy() <= points.max(axis=1)).all()
-    assert (second - first).numpy() == pytest.approx([0.1, 0.0, 0.2], abs=1e-4)
+    assert (first[:3].numpy() >= points.min(axis=1)).all()
+    assert (first[:3].numpy() <= points.max(axis=1)).all()
+    assert (second - first).numpy() == pytest.approx([0.1, 0.0, 0.2, 0.0], abs=1e-4)
+    assert first[3] == 0.0
+    # A wall of 160 mm height beside the box.
+    image[2, 12, CROP // 2] = 0.16
+    with torch.inference_mode():
+        beside = policy.find_target(torch.from_numpy(image[None]))[0].numpy()
+    assert beside[3] == pytest.approx(0.16 - beside[2], abs=1e-6)
 
 
 def test_held_out_moves_are_of_other_episodes(demonstrations: list[Demonstration]) -> None:
@@ -149,4 +155,13 @@ def test_a_folder_without_episodes_is_refused(tmp_path: Path) -> None:
 
 def test_lying_marker_has_its_top_at_its_side() -> None:
     marker = resting("large_marker", xy=(0.1, -0.1))
-    assert object_top(scene_of(marker), "large_marker") == pytest.approx([0.1, -0.1, 0.018])
+    assert object_target(scene_of(marker), "large_marker") == pytest.approx([0.1, -0.1, 0.018, 0.0])
+
+
+def test_neighbors_rise_above_the_target() -> None:
+    marker = resting("large_marker", xy=(0.1, -0.1))
+    box = resting("sugar_box", xy=(0.1, -0.1 + 0.0445 + 0.14))  # 89 mm wide and 38 mm high
+    far = resting("cracker_box", xy=(-0.25, 0.25))
+    assert object_target(scene_of(marker, far), "large_marker")[3] == 0.0
+    target = object_target(scene_of(marker, box, far), "large_marker")
+    assert target[3] == pytest.approx(0.038 - 0.018)

@@ -7,11 +7,12 @@
     python training/train_bc.py train --set observation=depth --out runs/bc_depth
     python training/train_bc.py evaluate runs/bc_state runs/bc_depth --out runs/bc.json
 
-The policy sees the joint angles and a target: the top of the picked object, from the state of the
-scene or from the overhead depth image with the mask of the object. Its action is a waypoint: the
-change of the joint angles within `LOOKAHEAD`. Demonstrations are the recorded commands between home
-and the grasp. States next to them are sampled, too, and lead to the same waypoints, so that the
-policy returns to its way. The angle of the last joint, about the cup's axis, is left as it is.
+The policy sees the joint angles and a target: the top of the picked object, and how far its
+neighbors rise above it, from the state of the scene or from the overhead depth image with the mask
+of the object. Its action is a waypoint: the change of the joint angles within `LOOKAHEAD`.
+Demonstrations are the recorded commands between home and the grasp. States next to them are
+sampled, too, and lead to the same waypoints, so that the policy returns to its way. The angle of
+the last joint, about the cup's axis, is left as it is.
 
 Frames: T is the support, G is the tool, z out of it, O is the picked object.
 """
@@ -84,6 +85,8 @@ STOP_CHANGE = 0.003
 """Change of a joint below which a waypoint counts as reached [rad]."""
 NUM_STOPS = 5
 """Number of successive actions below `STOP_CHANGE` at which the policy has stopped."""
+NEIGHBORHOOD = 0.15
+"""Horizontal distance from the target within which objects are its neighbors [m]."""
 MAX_DISPLACEMENT = 0.010
 """Largest displacement of the picked object in a playback that reaches it [m]."""
 STATES_PER_MOVE = 8
@@ -139,7 +142,7 @@ class Demonstration:
         tool: Name of the tool.
         time: Times of the commands [s]. Shape (m,).
         q: Commanded joint angles [rad]. Shape (m, n).
-        target: Top of the object: its center and its highest point [m]. Shape (3,).
+        target: Top of the object and rise of its neighbors [m], see `object_target`. Shape (4,).
         image: Points of the depth image around the object, relative to `window`, their height, and
             the mask of the object. None without images. Shape (4, CROP, CROP), see `crop_image`.
     """
@@ -155,10 +158,26 @@ class Demonstration:
     image: NDArray[np.float32] | None
 
 
-def object_top(scene: Scene, name: str) -> Floats:
-    """Return the center of an object with the height of its highest point [m]. Shape (3,)."""
-    scene_object = scene[name]
-    return np.array([*scene_object.X_TO.translation[:2], scene_object.top_height])
+def object_target(scene: Scene, name: str) -> Floats:
+    """Return the target of a pick: where it is, and how far its neighbors rise above it.
+
+    Args:
+        scene: Scene.
+        name: Name of the picked object.
+
+    Returns:
+        Center of the object with the height of its highest point, and the height of the highest
+        object within `NEIGHBORHOOD` above that, at least 0 [m]. Shape (4,).
+    """
+    picked = scene[name]
+    center = picked.X_TO.p[:2]
+    rise = 0.0
+    for other in scene.objects:
+        low, high = other.bounds_T
+        gap = np.maximum(np.maximum(low[:2] - center, center - high[:2]), 0.0)
+        if other.name != name and np.linalg.norm(gap) <= NEIGHBORHOOD:
+            rise = max(rise, other.top_height - picked.top_height)
+    return np.array([*center, picked.top_height, rise])
 
 
 def crop_image(action: RecordedAction, cell: WorkCell, index: int) -> NDArray[np.float32] | None:
@@ -229,7 +248,7 @@ def read_demonstrations(folder: Path) -> list[Demonstration]:
                     tool=action.tool,
                     time=samples.time[: grasp[0] + 1],
                     q=samples.q_commanded[: grasp[0] + 1],
-                    target=object_top(scene, action.move.pick),
+                    target=object_target(scene, action.move.pick),
                     image=crop_image(action, episode.cell, index),
                 )
             )
@@ -299,7 +318,7 @@ class ReachingPolicy(nn.Module):
         )
         size = 256
         self.head = nn.Sequential(
-            nn.Linear(num_joints - 1 + 3 + 3 * 3 + 2 * 2, size),
+            nn.Linear(num_joints - 1 + 4 + 3 * 3 + 2 * 2, size),
             nn.SiLU(),
             nn.Linear(size, size),
             nn.SiLU(),
@@ -311,7 +330,11 @@ class ReachingPolicy(nn.Module):
         self.register_buffer("action_scale", torch.full((num_joints - 1,), 0.1))
 
     def find_target(self, images: Tensor) -> Tensor:
-        """Return the attended point of the object [m], shape (b, 3), see `crop_image`."""
+        """Return the target, of which the point is attended to. Shape (b, 4).
+
+        Args:
+            images: See `crop_image`. Shape (b, 4, CROP, CROP).
+        """
         points, mask = images[:, :3], images[:, 3:]
         visible = mask > 0
         height = points[:, 2:]
@@ -320,8 +343,11 @@ class ReachingPolicy(nn.Module):
         shown = torch.cat([10 * (height - highest), 10 * (height - lowest), mask], dim=1)
         logits = self.attention(shown).masked_fill(~visible, -torch.inf)
         weights = logits.flatten(2).softmax(dim=2)
-        target: Tensor = (points.flatten(2) * weights).sum(dim=2)
-        return target
+        target = (points.flatten(2) * weights).sum(dim=2)
+        offsets = points - target.detach()[:, :, None, None]
+        is_near = ~visible & (offsets[:, :2].norm(dim=1, keepdim=True) <= NEIGHBORHOOD)
+        rise = torch.where(is_near, offsets[:, 2:], 0.0).amax(dim=(2, 3))
+        return torch.cat([target, rise], dim=1)
 
     def forward(self, q: Tensor, p_TG: Tensor, axis: Tensor, target: Tensor) -> Tensor:
         """Return the change of all joints but the last within `LOOKAHEAD` [rad].
@@ -330,9 +356,9 @@ class ReachingPolicy(nn.Module):
             q: Joint angles [rad]. Shape (b, n).
             p_TG: Position of the tool [m]. Shape (b, 3).
             axis: Axis of the tool in T. Shape (b, 3).
-            target: Point to reach [m]. Shape (b, 3).
+            target: Point to reach and rise of its neighbors [m]. Shape (b, 4).
         """
-        offset = target - p_TG
+        offset = target[:, :3] - p_TG
         tilt = axis[:, :2]
         features = [
             q[:, :-1] / 2,
@@ -409,7 +435,7 @@ class CloningLearner:
         self.losses = {"waypoint": loss.item()}
         if config.observation == "depth":
             # Where the demonstration ends, its tool is at the point to be found.
-            point_loss = functional.l1_loss(target, batch.end)
+            point_loss = functional.l1_loss(target[:, :3], batch.end)
             self.losses["target_mm"] = 1000 * point_loss.item()
             loss = loss + 10 * point_loss
         self._optimizer.zero_grad()
@@ -446,7 +472,7 @@ class StateBatch:
         q: Joint angles [rad]. Shape (b, n).
         p_TG: Position of the tool [m]. Shape (b, 3).
         axis: Axis of the tool. Shape (b, 3).
-        target: Top of the picked object [m]. Shape (b, 3).
+        target: Target, see `object_target` [m]. Shape (b, 4).
         end: Position of the tool at the end of the demonstration [m]. Shape (b, 3).
         change: Change of the joint angles to the waypoint [rad]. Shape (b, n - 1).
     """
@@ -549,7 +575,7 @@ class Controller:
         p_TG, axis = self._kinematics.pose(q)
         target = self._seen
         if target is None:
-            target = torch.from_numpy(object_top(scene, self._pick)[None].astype(np.float32))
+            target = torch.from_numpy(object_target(scene, self._pick)[None].astype(np.float32))
         inputs = [torch.from_numpy(x[None].astype(np.float32)) for x in (q, p_TG, axis)]
         with torch.inference_mode():
             change = self._policy(*inputs, target)[0].double().numpy()
@@ -674,7 +700,7 @@ def train(
                 target = network.find_target(torch.from_numpy(np.stack(images)))[shown.index]
             change = network(shown.q, shown.p_TG, shown.axis, target)
             error = relative_error(change, shown.change).mean()
-            distance = (target - shown.end).norm(dim=1).median()
+            distance = (target[:, :3] - shown.end).norm(dim=1).median()
         return {"held_out": float(error), "target_mm": 1000 * float(distance)}, learner.losses
 
     train_to_end(
