@@ -52,7 +52,7 @@ def message(spec: RobotSpec) -> str:
         ({"home": (0.0,) * 5}, f"robot.home: 5 values; expected 6 values, for {JOINTS}"),
         (
             {"home": (0.0, 0.0, 7.0, 0.0, 0.0, 0.0)},
-            "robot.home: 7 for joint 'elbow_joint'; expected from -6.28319 to 6.28319",
+            "robot.home: 7 for joint 'elbow_joint'; expected from -3.14159 to 3.14159",
         ),
         (
             {"limits_velocity": (1.0,) * 7},

@@ -70,8 +70,9 @@ def test_limits_and_masses_equal_the_published_values(plant: MultibodyPlant) -> 
     assert np.degrees(plant.GetVelocityUpperLimits()) == pytest.approx(
         [120, 120, 180, 180, 180, 180], abs=1e-3
     )
-    assert np.degrees(plant.GetPositionUpperLimits()) == pytest.approx([360] * 6)
-    assert np.degrees(plant.GetPositionLowerLimits()) == pytest.approx([-360] * 6)
+    limits = [360, 360, 180, 360, 360, 360]  # the elbow as in ur_description
+    assert np.degrees(plant.GetPositionUpperLimits()) == pytest.approx(limits)
+    assert np.degrees(plant.GetPositionLowerLimits()) == pytest.approx([-x for x in limits])
 
 
 def test_every_inertia_is_physical(plant: MultibodyPlant) -> None:

@@ -28,7 +28,8 @@ class JointRange:
     @property
     def exceeds_full_turn(self) -> NDArray[np.bool_]:
         """Whether each revolute joint's range exceeds a full turn. Shape (n,)."""
-        return np.asarray(self.revolute & (self.limits[:, 1] - self.limits[:, 0] > FULL_TURN))
+        width = self.limits[:, 1] - self.limits[:, 0]
+        return np.asarray(self.revolute & (width > FULL_TURN + _ROUNDING))
 
     def unwrap(self, q: Floats, reference: Floats) -> Floats:
         """Return the equivalent positions within the limits nearest to a reference.

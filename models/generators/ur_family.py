@@ -19,7 +19,11 @@ from drake_clutter.robots.ur_kinematics import (
 )
 
 JOINT_RANGE = 2 * math.pi
-"""Position limit of all joints in both directions [rad] (data sheets)."""
+"""Position limit of the joints in both directions [rad] (data sheets)."""
+ELBOW_JOINT = "elbow_joint"
+ELBOW_RANGE = math.pi
+"""Position limit of the elbow in both directions [rad]: half of the data sheets', as in
+ur_description. Nearer to a full turn, the forearm would have to pass through the upper arm."""
 TUBE_COLOR = "0.75 0.76 0.78 1"
 JOINT_COLOR = "0.58 0.60 0.63 1"
 CAP_COLOR = "0.36 0.55 0.74 1"
@@ -95,7 +99,7 @@ def ur_sdf(arm: UrArm) -> str:
                 visual_geometry=link.visual_geometry,
                 joint=joint,
                 X_PL=X_PL,
-                max_angle=JOINT_RANGE,
+                max_angle=ELBOW_RANGE if joint == ELBOW_JOINT else JOINT_RANGE,
                 max_torque=link.max_torque,
                 max_speed=link.max_speed,
             )
