@@ -161,7 +161,7 @@ def test_tensors_that_cannot_be_written_are_a_file_error(tmp_path: Path) -> None
     ("arguments", "choices"),
     [
         (["explore", "scene.yaml", "--fidelity", "x"], "'static_or_drake', 'settle', 'arm'"),
-        (["export", "scene.yaml", "--format", "x"], "'dmd', 'sdf', 'mjcf', 'glb'"),
+        (["export", "scene.yaml", "--format", "x"], "'dmd', 'sdf', 'mjcf', 'glb', 'usd'"),
     ],
 )
 def test_a_wrong_choice_names_the_choices(arguments: list[str], choices: str) -> None:

@@ -87,5 +87,6 @@ def test_images_of_version_0_1_are_extended(tmp_path: Path) -> None:
     (tmp_path / JOB_FILE).write_text(json.dumps(earlier))
     (tmp_path / "camera.json").touch()
     images = {"objects": "ycb7", "catalog": None, "heap_fraction": 0.3, "seed": 0}
+    images["renderer"] = "vtk"
     with open_job_folder(tmp_path, images | {"agents": ["random"]}):
         assert json.loads((tmp_path / JOB_FILE).read_text()) == earlier

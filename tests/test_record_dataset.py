@@ -136,7 +136,7 @@ def test_a_missing_episode_is_recorded_again_with_the_same_bytes(
     assert first.stat().st_mtime_ns == time
     assert summary["executed_moves"] == 2
     card = (dataset / "README.md").read_text()
-    assert "# Moves of moves in scenes0" in card
+    assert f"# Moves of moves in {job.scenes.name}" in card
     assert sorted(p.name for p in second.parent.iterdir()) == [first.name, second.name]
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 import trimesh
 from mcap.reader import make_reader
@@ -66,11 +67,13 @@ def rrd(
     assert [entry.name for entry in path.parent.iterdir()] == ["episode.rrd"]
     rows = defaultdict(list)
     for chunk in RrdReader(str(path)).stream():
-        for row in chunk.to_record_batch().to_pylist():
-            time = row.pop("time", None)
-            rows[str(chunk.entity_path)].append(
-                (np.nan if time is None else time.total_seconds(), row)
-            )
+        batch = chunk.to_record_batch()
+        # Python has no times in nanoseconds.
+        columns = [c.cast(pa.int64()) if pa.types.is_temporal(c.type) else c for c in batch.columns]
+        for row in pa.RecordBatch.from_arrays(columns, batch.schema.names).to_pylist():
+            nanoseconds = row.pop("time", None)
+            time = np.nan if nanoseconds is None else nanoseconds / 1e9
+            rows[str(chunk.entity_path)].append((time, row))
     return {path: sorted(found, key=lambda row: row[0]) for path, found in rows.items()}
 
 

@@ -324,6 +324,7 @@ class MotionRecorder:
             X_TO: Poses of the plant, whose signs of quaternions are kept. Shape (o, 7).
         """
         poses = np.array([[*o.X_TO.quaternion, *o.X_TO.translation] for o in self._scene.objects])
+        poses = poses.reshape(X_TO.shape)  # also without objects
         dot = (poses[:, :4] * X_TO[:, :4]).sum(axis=1, keepdims=True)
         poses[:, :4] *= np.where(dot < 0, -1.0, 1.0)
         return poses
