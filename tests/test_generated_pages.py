@@ -18,6 +18,7 @@ import results_calibration
 import results_closed_loop
 import results_exploration
 import results_export
+import results_feasibility
 import results_generation
 import results_index
 import results_intervals
@@ -38,6 +39,7 @@ RESULTS = {
         results_closed_loop,
         results_exploration,
         results_export,
+        results_feasibility,
         results_generation,
         results_index,
         results_intervals,

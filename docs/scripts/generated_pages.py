@@ -18,6 +18,7 @@ import results_calibration
 import results_closed_loop
 import results_exploration
 import results_export
+import results_feasibility
 import results_generation
 import results_index
 import results_intervals
@@ -43,6 +44,7 @@ PAGES: Mapping[str, Callable[[], str]] = {
     "results/calibration.md": results_calibration.page,
     "results/intervals.md": results_intervals.page,
     "results/export.md": results_export.page,
+    "results/feasibility.md": results_feasibility.page,
     "results/mutation_testing.md": results_mutation.page,
     "results/negative_results.md": results_negative.page,
     **{

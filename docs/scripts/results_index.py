@@ -18,6 +18,7 @@ PAGES = (
     ("calibration.md", "Calibration", "Random scenes compared with the paper's"),
     ("intervals.md", "Confidence intervals", "Methods, and their coverage for few values"),
     ("export.md", "Exported scenes", "Stable scenes and recorded motions in other simulators"),
+    ("feasibility.md", "Feasibility studies", "Inverse reachability map compared with the planner"),
     ("mutation_testing.md", "Mutation testing", "Small faults of the code that the tests catch"),
     ("negative_results.md", "Negative results", "What did not help"),
 )
