@@ -60,8 +60,8 @@ _MAX_SOLUTIONS = 8
 class InverseReachabilityMap:
     """Reachability of a vertical tool over radius, height and yaw relative to the base.
 
-    Solutions are told apart by their inverse kinematics branches, or for robots without branches by
-    the eighth of a turn in which their first joint is.
+    Solutions are grouped by inverse kinematics branch, or for robots without branches by the eighth
+    of a turn in which their first joint is.
 
     Attributes:
         heights: Heights of G in B [m]. Shape (n_z,).
