@@ -26,6 +26,7 @@ import results_judge_agreement
 import results_mutation
 import results_negative
 import results_perception
+import results_recording
 import results_rendering
 from markdown_text import estimate, number, table
 from results_files import with_current_keys
@@ -47,6 +48,7 @@ RESULTS = {
         results_mutation,
         results_negative,
         results_perception,
+        results_recording,
         results_rendering,
     )
 }

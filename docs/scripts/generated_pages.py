@@ -26,6 +26,7 @@ import results_judge_agreement
 import results_mutation
 import results_negative
 import results_perception
+import results_recording
 import results_rendering
 
 PAGES: Mapping[str, Callable[[], str]] = {
@@ -45,6 +46,7 @@ PAGES: Mapping[str, Callable[[], str]] = {
     "results/intervals.md": results_intervals.page,
     "results/export.md": results_export.page,
     "results/feasibility.md": results_feasibility.page,
+    "results/recording.md": results_recording.page,
     "results/mutation_testing.md": results_mutation.page,
     "results/negative_results.md": results_negative.page,
     **{

@@ -19,6 +19,11 @@ PAGES = (
     ("intervals.md", "Confidence intervals", "Methods, and their coverage for few values"),
     ("export.md", "Exported scenes", "Stable scenes and recorded motions in other simulators"),
     ("feasibility.md", "Feasibility studies", "Inverse reachability map compared with the planner"),
+    (
+        "recording.md",
+        "Recording",
+        "Moves per hour with and without images, and where the time goes",
+    ),
     ("mutation_testing.md", "Mutation testing", "Small faults of the code that the tests catch"),
     ("negative_results.md", "Negative results", "What did not help"),
 )

@@ -1,0 +1,74 @@
+"""The page docs/results/recording.md."""
+
+from markdown_text import number, section, table
+from results_files import read_benchmark_results
+
+IMAGES = {"none": "none", "RGB-D": "color and depth"}
+"""Names of the kinds of images, by those in the results file."""
+
+
+def page() -> str:
+    """Return the page."""
+    results = read_benchmark_results("recording_throughput.json")
+    camera = results["camera"]
+    size = f"{camera['width']} x {camera['height']}"
+    text = (
+        "# Recording\n\nHow fast `drake-clutter record` makes data sets "
+        "([how to record](../how_to/record_trajectories.md)).\n\n"
+    )
+    text += section(
+        "Throughput of recording",
+        f"Episodes of the policy `{results['policy']}` in scenes of `{results['scenes']}`, at most "
+        f"{results['max_moves']} moves each, {results['rate_hz']:g} samples per second. With "
+        f"images: {size} pixels of the camera `{camera['name']}`, {camera['rate_hz']} per second. "
+        f"{results['machine']['cpu']}, {results['cores']} cores. *Moves per hour*: carried out by "
+        "all workers, after the first episode of each; "
+        f"{results['episodes_per_worker']} episodes for each worker.",
+        command="python benchmarks/recording_throughput.py "
+        f"--episodes {results['episodes_per_worker']} --out FILE",
+        seed=str(results["seed"]),
+        results=["benchmarks/results/recording_throughput.json"],
+    )
+    text += table(
+        ["images", "workers", "moves", "moves per hour", "start [s]", "summary and card [s]"],
+        [
+            [
+                IMAGES[row["images"]],
+                str(row["workers"]),
+                str(row["moves"]),
+                f"{row['moves_per_hour']:,.0f}",
+                number(row["start_s"]),
+                number(row["finish_s"]),
+            ]
+            for row in results["rows"]
+        ],
+    )
+    text += "\n## Where the time goes\n\nShares of the time of one worker.\n\n"
+    text += table(["part", *IMAGES.values()], _share_rows(results["shares"]))
+    text += (
+        f"\n## More workers\n\nTime for {results['model_moves']:,} moves by a model, not by a "
+        "measurement: each worker has a core of its own and is as fast as the one that was "
+        "measured, and a single process reads all episodes for the card at the end. See "
+        "`benchmarks/recording_throughput.py`.\n\n"
+    )
+    return text + table(
+        ["images", "workers", "hours", "moves per hour", "core hours per 1,000 moves"],
+        [
+            [
+                IMAGES[row["images"]],
+                f"{row['workers']:,}",
+                number(row["hours"]),
+                f"{row['moves_per_hour']:,.0f}",
+                number(row["core_hours_per_1000_moves"]),
+            ]
+            for row in results["model"]
+        ],
+    )
+
+
+def _share_rows(shares: dict[str, dict[str, float]]) -> list[list[str]]:
+    """Return a row for each part of the work."""
+    parts = dict.fromkeys(part for kind in IMAGES for part in shares[kind])
+    return [
+        [part, *(f"{100 * shares[kind].get(part, 0.0):.0f} %" for kind in IMAGES)] for part in parts
+    ]
