@@ -1,6 +1,7 @@
 # make demo   SG* makes a scene, the arm searches it; the results are in out/demo
 # make test   every check: lint, format, spelling, types, tests
-# make nightly   the tests that take hours: DAMAGED_FILES damaged files of each kind, KILLS stops of each command
+# make nightly   what takes hours: DAMAGED_FILES damaged files of each kind, KILLS stops of each command,
+#                EXPORTED_SCENES scenes of each generator in other simulators, MUTANTS mutants of the code
 # make test-any PYTHON=...   the tests with an interpreter and its packages as they are, without what is not installed
 # make docs   the documentation site: out/site/index.html
 # Each makes its own environment in .venv first; the demo's has only what the demo needs.
@@ -8,7 +9,7 @@
 PYTHON ?= python3
 PIP := .venv/bin/python -m pip --disable-pip-version-check --quiet install --no-compile
 
-.PHONY: demo docs nightly test test-any
+.PHONY: demo docs nightly nightly-exports nightly-mutants nightly-tests test test-any
 
 demo: .venv/demo
 	rm -rf out/demo
@@ -23,8 +24,22 @@ test: .venv/all
 
 nightly: export DAMAGED_FILES ?= 2000
 nightly: export KILLS ?= 20
+nightly: export EXPORTED_SCENES ?= 100
+nightly: export MUTANTS ?= 500
+nightly: export OMP_NUM_THREADS = 1
 nightly: .venv/all
-	OMP_NUM_THREADS=1 .venv/bin/pytest --numprocesses 2 tests/test_damaged_files.py tests/test_kills.py
+	$(MAKE) --keep-going nightly-tests nightly-exports nightly-mutants
+
+nightly-tests:
+	.venv/bin/pytest --numprocesses 2 tests/test_damaged_files.py tests/test_kills.py
+
+nightly-exports:
+	.venv/bin/python benchmarks/exported_stability.py out/nightly/exports --count $(EXPORTED_SCENES) --workers 2
+
+nightly-mutants:
+	.venv/bin/python benchmarks/mutation_testing.py cover --out out/nightly/coverage --workers 2
+	.venv/bin/python benchmarks/mutation_testing.py run --coverage out/nightly/coverage \
+	    --out out/nightly/mutants_$(MUTANTS).json --count $(MUTANTS) --workers 2
 
 test-any:
 	OMP_NUM_THREADS=1 PYTHONPATH=$(CURDIR) $(PYTHON) -m pytest -q -rs --ignore tests/test_install.py

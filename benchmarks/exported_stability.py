@@ -5,6 +5,7 @@
 Takes shipped stable scenes of every generator at their settled poses, exports them, and simulates
 each in both simulators. A scene stays if no object is ever farther than `MAX_DISPLACEMENT` from
 where it was. FOLDER keeps the displacements; an interrupted run is resumed by the same command.
+The exit code is 1 if less than `MIN_SHARE_AT_REST` of the scenes of a dataset stay.
 """
 
 import tempfile
@@ -36,6 +37,8 @@ DATASETS = ("rg_25", "hill_climbing_25", "sg_25", "sg_star_25", "sg_14")
 """One dataset of each generator."""
 MAX_DISPLACEMENT = 0.010
 """Largest displacement of an object that counts as at rest [m]."""
+MIN_SHARE_AT_REST = 0.97
+"""Share of the scenes of a dataset that are to stay in each simulator."""
 DURATION = 10.0
 """Simulated time [s]."""
 SAMPLE_PERIOD = 0.1
@@ -213,6 +216,8 @@ def main(
             for row in rows
         ]
     )
+    if min(row["at_rest_share"] for row in rows) < MIN_SHARE_AT_REST:
+        raise typer.Exit(1)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,8 @@
 `cover` records which lines each test executes; it needs the package `coverage`. `run` samples
 mutants (`mutation_operators.py`) and runs, for each, the tests that execute the changed line, the
 fastest first, until one fails. Tests that execute other lines of the module follow, up to
-`MAX_SECONDS`. Both commands resume.
+`MAX_SECONDS`. Both commands resume. `run --again caught` tests mutants again that were caught,
+beginning with the test that caught them.
 
 Modules with compiled functions are tested without the compiler: the tracer does not see compiled
 code, and compiling every mutant takes longer than interpreting small cases.
@@ -167,8 +168,10 @@ TEST_LIMIT = 10.0
 """A test that takes longer is not used [s]."""
 MAX_SECONDS = 30.0
 """Processor time of the tests of a mutant without the mutant [s]."""
-OUTCOMES = ("caught", "equivalent", "survived")
-"""Outcomes of mutants."""
+OUTCOMES = ("caught", "timed out", "equivalent", "survived")
+"""Outcomes of mutants. Of those that timed out, two runs exceeded a limit of processor time."""
+MIN_SCORE = 0.9
+"""Share of the mutants that are not equivalent which is to be caught or to time out."""
 EQUIVALENT = ROOT / "benchmarks/equivalent_mutants.json"
 """Reasons why a mutant gives the same results as the original, by key of the mutant."""
 
@@ -314,10 +317,14 @@ class TestCoverage:
         first, last = mutant.statement
         return any(first <= line <= last for line in self.lines.get(mutant.path, {}).get("", ()))
 
-    def tests(self, mutant: Mutant) -> tuple[list[str], int]:
+    def tests(self, mutant: Mutant, first_test: str | None) -> tuple[list[str], int]:
         """Return the tests of a mutant in the order of execution.
 
         Of code that runs on import, all tests of the module may show the result.
+
+        Args:
+            mutant: The mutant.
+            first_test: A test that is to be the first; None for the fastest one.
 
         Returns:
             The tests, and how many of them execute the changed statement.
@@ -333,7 +340,7 @@ class TestCoverage:
         total = 0.0
         chosen = list[str]()
         for tests in (executing, others):
-            for test in sorted(tests, key=self.seconds.__getitem__):
+            for test in sorted(tests, key=lambda test: (test != first_test, self.seconds[test])):
                 if total + self.seconds[test] <= MAX_SECONDS:
                     total += self.seconds[test]
                     chosen.append(test)
@@ -371,8 +378,9 @@ def cover(
             with worker_pool(min(workers, len(missing)), kind, files, compiled=compiled) as pool:
                 results = run_jobs(pool, [jobs[name] for name in missing])
                 for index, result in progress(results, folder.name, len(missing)):
-                    if "failure" in result:
-                        print(f"{missing[index]}: {result['failure']}", file=sys.stderr)
+                    if "outcomes" not in result:
+                        reason = result.get("failure", result.get("error"))
+                        print(f"{missing[index]}: {reason}", file=sys.stderr)
                     else:
                         blobs = git_blobs([*jobs[missing[index]]["files"], *result["lines"]])
                         write_json(folder / f"{missing[index]}.json", result | {"blobs": blobs})
@@ -399,9 +407,9 @@ def sample_mutants(count: int, seed: int) -> list[Mutant]:
     return sorted(sample, key=lambda mutant: (order.index(mutant.path), mutant.start))
 
 
-def mutant_job(mutant: Mutant, covered: TestCoverage) -> Job:
-    """Return the job of a mutant."""
-    tests, _ = covered.tests(mutant)
+def mutant_job(mutant: Mutant, covered: TestCoverage, first_test: str | None) -> Job:
+    """Return the job of a mutant; see `TestCoverage.tests`."""
+    tests, _ = covered.tests(mutant, first_test)
     return {
         "path": mutant.path,
         "function": mutant.function,
@@ -433,6 +441,7 @@ def mutant_row(mutant: Mutant, result: Result, num_executing: int) -> Row:
     outcomes = result.get("outcomes", {})
     failed = [test for test, (outcome, _) in outcomes.items() if outcome == "failed"]
     caught_by = failed[0] if failed else result.get("failure")
+    outcome = "timed out" if result.get("is_too_slow") else "caught"
     return {
         "key": mutant.key,
         "group": module_files()[mutant.path],
@@ -443,7 +452,7 @@ def mutant_row(mutant: Mutant, result: Result, num_executing: int) -> Row:
         "operator": mutant.operator,
         "original": mutant.original,
         "replacement": mutant.replacement,
-        "outcome": "caught" if caught_by else "survived",
+        "outcome": outcome if caught_by else "survived",
         "caught_by": caught_by,
         "tests": len(outcomes),
         "tests_of_the_line": num_executing,
@@ -462,8 +471,11 @@ def run(
         list[str] | None, typer.Option("--group", help="Only these groups. May be repeated.")
     ] = None,
     again: Annotated[
-        bool, typer.Option("--again", help="Test also mutants again that survived.")
-    ] = False,
+        list[str] | None,
+        typer.Option(
+            "--again", help="Test also mutants again that have this outcome. May be repeated."
+        ),
+    ] = None,
     out: ResultsOption = None,
 ) -> None:
     """Sample mutants and test those that the results file lacks.
@@ -471,13 +483,17 @@ def run(
     The sample is drawn anew from the code as it is. A mutant whose line has not changed has the
     same key, and its result is kept. One whose line has changed leaves the sample, its result is
     removed, and the next mutant in the order of the seed takes its place.
+
+    Exits with code 1 if the score of the file is below `MIN_SCORE`.
     """
+    if unknown := {*(again or ())} - {*OUTCOMES}:
+        raise InputError(f"--again {min(unknown)}; expected {', '.join(OUTCOMES)}")
     out = out or ROOT / "benchmarks/results/mutation_testing.json"
     results = ResultsFile(out, {"seed": seed, "count": count}, ("key",))
     software = provenance()
     sample = sample_mutants(count, seed)
     num_removed = results.keep({(mutant.key,) for mutant in sample})
-    known = {row["key"]: row["outcome"] for row in results.read()}
+    known = {row["key"]: row for row in results.read()}
     outdated = [path for path in coverage.glob("*/*.json") if not is_current(path)]
     print(
         f"{num_removed} results removed: their mutants are no longer in the sample\n"
@@ -488,9 +504,10 @@ def run(
     missing = [
         mutant
         for mutant in sample
-        if (mutant.key not in known or (again and known[mutant.key] == "survived"))
+        if (mutant.key not in known or known[mutant.key]["outcome"] in (again or ()))
         and (not group or module_files()[mutant.path] in group)
     ]
+    caught_by = {key: row["caught_by"] for key, row in known.items()}
     for compiled in (False, True):
         covered = TestCoverage.read(coverage / ("compiled" if compiled else "interpreted"))
         remaining = [mutant for mutant in missing if is_compiled(mutant.path) != compiled]
@@ -501,18 +518,20 @@ def run(
         for kind, mutants in by_kind.items():
             if not mutants:
                 continue
-            jobs = [mutant_job(mutant, covered) for mutant in mutants]
+            jobs = [mutant_job(mutant, covered, caught_by.get(mutant.key)) for mutant in mutants]
             files = sorted({file for job in jobs for file in job["files"]})
             with worker_pool(min(workers, len(jobs)), kind, files, compiled=compiled) as pool:
                 for index, result in progress(run_jobs(pool, jobs), kind, len(jobs)):
                     mutant = mutants[index]
                     if result.get("failure") == NOT_REPLACED:
                         by_kind["fresh"].append(mutant)
+                    elif "error" in result:
+                        print(f"{mutant.key}: {result['error']}", file=sys.stderr)
                     else:
-                        row = mutant_row(mutant, result, covered.tests(mutant)[1])
+                        row = mutant_row(mutant, result, covered.tests(mutant, None)[1])
                         results.add(row | software)
     reasons = json.loads(EQUIVALENT.read_text(encoding="utf-8"))
-    survivors = [row for row in results.read() if row["outcome"] != "caught"]
+    survivors = [row for row in results.read() if row["outcome"] == "survived"]
     results.add(
         *(
             row | {"outcome": "equivalent", "reason": reasons[row["key"]]}
@@ -520,11 +539,13 @@ def run(
             if row["key"] in reasons
         )
     )
-    show(results.read())
+    if show(results.read()) < MIN_SCORE:
+        raise typer.Exit(1)
 
 
-def show(rows: Sequence[Row]) -> None:
-    """Print the survivors, and the score of each group."""
+def show(rows: Sequence[Row]) -> float:
+    """Print the survivors and the score of each group, and return the score of all."""
+    score = 1.0
     for row in rows:
         if row["outcome"] == "survived":
             print(f"{row['key']} {row['path']}:{row['line']}: {row['code']}")
@@ -534,14 +555,18 @@ def show(rows: Sequence[Row]) -> None:
         of_group = [row for row in rows if name in (row["group"], "all")]
         counts = Counter(dict.fromkeys(OUTCOMES, 0))
         counts.update(row["outcome"] for row in of_group)
+        judged = len(of_group) - counts["equivalent"]
+        score = (counts["caught"] + counts["timed out"]) / judged if judged else 1.0
         table.append(
             {
                 "group": name,
                 "mutants": len(of_group),
                 **{outcome: counts[outcome] for outcome in OUTCOMES},
+                "score": f"{score:.3f}",
             }
         )
     print_table(table)
+    return score
 
 
 if __name__ == "__main__":

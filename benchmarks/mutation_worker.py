@@ -31,6 +31,7 @@ from contextlib import suppress
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, SourceFileLoader
 from importlib.util import spec_from_file_location
+from itertools import zip_longest
 from pathlib import Path
 from types import CodeType, FrameType, FunctionType, ModuleType
 from typing import Any
@@ -44,8 +45,8 @@ null for all of the files; `test_limit`: time limit of other tests [s]; `time_li
 `source`."""
 Result = dict[str, Any]
 """Fields: `outcomes`: outcome and time [s] by test; `lines` executed, by file and test, where an
-empty name stands for imports; `is_too_slow` if a test was stopped; `failure` of a process that
-ended without outcomes."""
+empty name stands for imports; `is_too_slow` if a test or the process was stopped; `failure` of a
+process that ended without outcomes; `error` of this program, which says nothing on the mutant."""
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = (
@@ -75,6 +76,8 @@ OPTIONS = ("-q", "-x", "--tb=native", "-p", "no:cacheprovider", "-p", "no:xdist"
 
 Its own tracebacks cannot show `TooSlow` where Python has no number of a line.
 """
+_STOPPED = (signal.SIGXCPU, signal.SIGKILL)
+"""Signals that end a process that exceeds `time_limit` or idles."""
 IDLE_TIME = 60.0
 """Time after which a process that neither runs nor waits for a processor is ended [s]."""
 
@@ -285,7 +288,7 @@ class Collection:
         run = TestRun(job)
         config.pluginmanager.register(run)
         items = run.select(self._session.items)
-        for item, following in zip(items, [*items[1:], None], strict=True):
+        for item, following in zip_longest(items, items[1:]):
             config.hook.pytest_runtest_protocol(item=item, nextitem=following)
             if run.has_failed() and "source" in job:
                 break
@@ -311,7 +314,7 @@ def run_job(job: Job, run: Callable[[Job], Result]) -> Result:
         try:
             result = run(job)
         except Exception as error:
-            result = {"failure": f"{type(error).__name__}: {error}"}
+            result = {"error": f"{type(error).__name__}: {error}"}
         with os.fdopen(writing, "w") as stream:
             json.dump(result, stream)
         os._exit(0)
@@ -325,7 +328,8 @@ def run_job(job: Job, run: Callable[[Job], Result]) -> Result:
     try:
         received: Result = json.loads(answer)
     except json.JSONDecodeError:
-        return {"failure": f"process ended with status {status}"}
+        stopped = os.WIFSIGNALED(status) and os.WTERMSIG(status) in _STOPPED
+        return {"failure": f"process ended with status {status}", "is_too_slow": stopped}
     return received
 
 
@@ -383,7 +387,8 @@ def main() -> None:
         for line in sys.stdin:
             job = json.loads(line)
             result = run_job(job, run)
-            if (result.get("is_too_slow") or "failure" in result) and "source" in job:
+            is_doubtful = result.get("is_too_slow") or "outcomes" not in result
+            if is_doubtful and "source" in job:
                 # Perhaps because it compiled functions, which are in the cache from then on, or
                 # because memory was short.
                 result = run_job(job, run)

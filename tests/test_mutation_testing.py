@@ -3,10 +3,12 @@
 import ast
 import json
 import os
+import signal
 import subprocess
 import time
 from importlib.util import module_from_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -14,6 +16,7 @@ from benchmarks import mutation_testing
 from benchmarks.mutation_operators import find_mutants, rank
 from benchmarks.mutation_testing import TestCoverage, git_blobs, is_current, mutant_row
 from benchmarks.mutation_worker import (
+    Collection,
     Job,
     MutatedModule,
     Result,
@@ -109,12 +112,13 @@ def test_the_tests_of_the_line_come_first_and_the_fastest_of_them_first(tmp_path
         json.dumps({"outcomes": outcomes, "lines": {"module.py": lines}})
     )
     covered = TestCoverage.read(tmp_path)
-    assert covered.tests(mutant) == (["fast", "slow", "beside"], 2)
+    assert covered.tests(mutant, None) == (["fast", "slow", "beside"], 2)
+    assert covered.tests(mutant, "slow") == (["slow", "fast", "beside"], 2)
     (tmp_path / "imports.json").write_text(
         json.dumps({"outcomes": {}, "lines": {"module.py": {"": [first]}}})
     )
     covered = TestCoverage.read(tmp_path)
-    assert covered.tests(mutant) == (["beside", "fast", "slow"], 3)
+    assert covered.tests(mutant, None) == (["beside", "fast", "slow"], 3)
     assert covered.runs_at_import(mutant)
     assert not covered.runs_at_import(find_mutants("module.py", SOURCE)[0])
 
@@ -168,6 +172,51 @@ def test_a_module_is_imported_with_another_source() -> None:
     assert module.VALUE == 5
 
 
+def test_a_test_that_is_stopped_for_its_time_is_no_failure() -> None:
+    (mutant,) = (
+        m
+        for m in find_mutants("drake_clutter/stability/nnls.py", "def f(x):\n    return x * 2\n")
+        if m.original == "*"
+    )
+    outcomes = {"a": ("passed", 0.1), "b": ("failed", 3.5)}
+    row = mutant_row(mutant, {"outcomes": outcomes, "is_too_slow": True}, 2)
+    assert (row["outcome"], row["caught_by"]) == ("timed out", "b")
+    row = mutant_row(mutant, {"failure": "process ended with status 24", "is_too_slow": True}, 1)
+    assert row["outcome"] == "timed out"
+
+
+def test_a_process_that_exceeds_its_processor_time_is_too_slow() -> None:
+    def run(job: Job) -> Result:
+        while True:
+            pass
+
+    result = run_job({"time_limit": 1.0}, run)
+    assert result["is_too_slow"]
+    assert result["failure"].startswith("process ended with status")
+
+    def end(job: Job) -> Result:
+        os.kill(os.getpid(), signal.SIGSEGV)
+        return {}
+
+    result = run_job({"time_limit": 60.0}, end)
+    assert not result["is_too_slow"]
+
+
+def test_a_mutant_without_tests_is_not_caught() -> None:
+    """Neither is one whose tests could not be run for a fault of the worker."""
+    job = {"measured": [], "limits": {}, "files": [], "test_limit": 1.0}
+    collection = Collection(lambda run: None)
+    collection._session = SimpleNamespace(
+        items=[], config=SimpleNamespace(pluginmanager=pytest.PytestPluginManager())
+    )  # type: ignore[assignment]
+    collection._functions = []
+    result = collection._run(job)
+    assert result["outcomes"] == {}
+    (mutant, *_) = find_mutants("drake_clutter/stability/nnls.py", "def f(x):\n    return x * 2\n")
+    row = mutant_row(mutant, result, 0)
+    assert (row["outcome"], row["caught_by"], row["tests"]) == ("survived", None, 0)
+
+
 def test_an_exception_in_the_process_of_a_job_is_its_result() -> None:
     def run(job: Job) -> Result:
         if job["files"]:
@@ -176,7 +225,7 @@ def test_an_exception_in_the_process_of_a_job_is_its_result() -> None:
 
     job = {"time_limit": 60.0, "files": []}
     assert run_job(job, run) == {"outcomes": {}}
-    assert run_job(job | {"files": ["a"]}, run) == {"failure": "ValueError: no tests"}
+    assert run_job(job | {"files": ["a"]}, run) == {"error": "ValueError: no tests"}
 
 
 def test_processor_times_of_a_process_group() -> None:

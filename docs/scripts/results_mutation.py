@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from benchmarks.mutation_testing import OUTCOMES
 from drake_clutter.statistics import wilson_interval
 from markdown_text import section, table
 from results_files import read_benchmark_results
@@ -14,16 +15,14 @@ RESULTS = "benchmarks/results/mutation_testing.json"
 def _score(name: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
     counts = Counter(row["outcome"] for row in rows)
     judged = len(rows) - counts["equivalent"]
-    interval = wilson_interval(counts["caught"], judged)
-    low, high = interval
+    noticed = counts["caught"] + counts["timed out"]
+    low, high = wilson_interval(noticed, judged)
     return [
         name,
         str(len(rows)),
-        str(counts["caught"]),
-        str(counts["equivalent"]),
-        str(counts["survived"]),
-        f"{counts['caught'] / len(rows):.2f}",
-        f"{counts['caught'] / judged:.2f} ({low:.2f} to {high:.2f})",
+        *(str(counts[outcome]) for outcome in OUTCOMES),
+        f"{noticed / len(rows):.3f}",
+        f"{noticed / judged:.3f} ({low:.2f} to {high:.2f})",
     ]
 
 
@@ -31,19 +30,19 @@ def _scores(rows: Sequence[Mapping[str, Any]], sample: int, seed: int) -> str:
     text = section(
         "Scores",
         f"{len(rows)} of a uniform sample of {sample} mutants of the modules that decide results. "
-        "*Caught*: a test fails, the process ends, or the time limit is exceeded. *Equivalent*: "
-        "the mutant gives the same results as the original. The results file names the content "
-        "of the module, as a Git blob, at which each mutant was tested.",
+        "*Caught*: a test fails, or the process ends. *Timed out*: two runs exceed a limit of "
+        "processor time, as of a loop without an end. *Equivalent*: the mutant gives the same "
+        "results as the original. The last two columns count mutants that are caught or time out. "
+        "The results file names the content of the module, as a Git blob, at which each mutant "
+        "was tested.",
         command="python benchmarks/mutation_testing.py run --coverage FOLDER",
         seed=seed,
         results=[RESULTS],
     )
     groups = dict.fromkeys(row["group"] for row in rows)
     body = [_score(name, [row for row in rows if row["group"] == name]) for name in groups]
-    head = ["modules", "mutants", "caught", "equivalent", "survived"]
-    return text + table(
-        [*head, "caught of all", "caught of those not equivalent"], [*body, _score("all", rows)]
-    )
+    head = ["modules", "mutants", *OUTCOMES, "of all", "of those not equivalent"]
+    return text + table(head, [*body, _score("all", rows)])
 
 
 def _code(text: str) -> str:
