@@ -6,28 +6,27 @@ import numpy as np
 import pytest
 import torch
 from conftest import DEFAULT_CELL, resting, scene_of
+from recorded_episodes import synthetic_episode
 
 from drake_clutter.files import InputError
 from drake_clutter.planning.motion_plan import MotionPlan
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.recording.recorded_episode import CameraImages, RecordedAction
-from drake_clutter.scenes.interfaces import Move, MoveResult
-from training.train_bc import (
+from drake_clutter.recording.hdf5_file import save_episode
+from drake_clutter.recording.recorded_episode import CameraImages
+from training.reaching_demonstrations import (
     CROP,
-    LOOKAHEAD,
-    CloningConfig,
-    CloningLearner,
     Demonstration,
-    ReachingPolicy,
-    StateSampler,
     ToolKinematics,
     crop_image,
     object_target,
-    play,
     read_demonstrations,
+    read_first_images,
     split,
 )
+from training.reaching_learner import CloningConfig, CloningLearner, StateSampler
+from training.reaching_playback import play
+from training.reaching_policy import LOOKAHEAD, ReachingPolicy
 
 PLACES = ((0.1, 0.1), (-0.1, 0.15), (0.05, -0.15))
 
@@ -112,8 +111,7 @@ def test_target_from_the_depth_image() -> None:
     intrinsics = (309.0, 309.0, 159.0, 119.0)
     X_TC = np.array([[0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.6]])
     images = CameraImages(np.zeros(1), X_TC, intrinsics, None, depth[None], segmentation[None])
-    action = RecordedAction(Move("c"), MoveResult.PLACED, images={"overhead": images})
-    image = crop_image(action, DEFAULT_CELL, 2)
+    image = crop_image(images, 2)
     assert image is not None
     assert image.shape == (4, CROP, CROP)
     assert image[3].sum() == 20 * 25
@@ -122,7 +120,7 @@ def test_target_from_the_depth_image() -> None:
     x = (209.5 - 159.0) / 309.0 * 1.54
     y = -(109.5 - 119.0) / 309.0 * 1.54
     assert center == pytest.approx([x, y, 0.06], abs=1e-4)
-    assert crop_image(action, DEFAULT_CELL, 0) is None  # The object is not in the image.
+    assert crop_image(images, 0) is None  # The object is not in the image.
     # The target is a mean of points of the object, and moves with the scene.
     policy = ReachingPolicy("depth", 6)
     shifted = image + np.array([0.1, 0.0, 0.2, 0.0], np.float32)[:, None, None]
@@ -140,6 +138,20 @@ def test_target_from_the_depth_image() -> None:
     assert beside[3] == pytest.approx(0.16 - beside[2], abs=1e-6)
 
 
+def test_first_images_are_those_of_the_recording(tmp_path: Path) -> None:
+    episode = synthetic_episode(cameras={"overhead": 4, "wrist": 5})
+    save_episode(tmp_path / "episode.h5", episode)
+    images = read_first_images(tmp_path / "episode.h5", 1)
+    expected = episode.actions[0].images["overhead"]
+    assert images is not None
+    assert images.depth is not None
+    assert expected.depth is not None
+    assert images.intrinsics == expected.intrinsics
+    assert np.array_equal(images.X_TC, expected.X_TC[:1])
+    assert np.array_equal(images.depth, expected.depth[:1])
+    assert read_first_images(tmp_path / "episode.h5", 2) is None  # It was not executed.
+
+
 def test_held_out_moves_are_of_other_episodes(demonstrations: list[Demonstration]) -> None:
     learned, held_out = split(demonstrations, 1)
     assert [d.name for d in learned] == ["episode_000000 0", "episode_000001 0"]
@@ -150,7 +162,7 @@ def test_held_out_moves_are_of_other_episodes(demonstrations: list[Demonstration
 
 def test_a_folder_without_episodes_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected recorded moves of one cell"):
-        read_demonstrations(tmp_path)
+        read_demonstrations(tmp_path, "large")
 
 
 def test_lying_marker_has_its_top_at_its_side() -> None:

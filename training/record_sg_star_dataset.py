@@ -1,11 +1,13 @@
 """Record the data set of 1,000 moves over `sg_star_25` whose card is published.
 
-    python training/record_sg_star_dataset.py --workers 2 --out FOLDER --card training/datasets
+    python training/record_sg_star_dataset.py --workers 2 --out FOLDER \
+        --card training/datasets/sg_star_25_moves
 
-Random legal moves of the arm, five in an episode, with color and depth of the overhead camera at
-10 Hz. The card, `README.md` with its pictures, is copied to the folder of `--card`; the data stays
-in FOLDER. An interrupted run is resumed by the same command. The scenes are those of an evaluation:
-a policy that is trained on them is not to be evaluated on `sg_star_25`.
+Random legal moves of the arm, five in an episode, with color, depth and segmentation of the
+overhead camera at 10 Hz. `train_bc.py` learns from them. The card, `README.md` with its pictures,
+is copied to the folder of `--card`; the data stays in FOLDER. An interrupted run is resumed by the
+same command. The scenes are those of an evaluation: an explorer that is trained on them is not to
+be evaluated on `sg_star_25`.
 """
 
 import math
@@ -17,12 +19,10 @@ from typing import Annotated
 import typer
 
 from drake_clutter.commands.episode_scenes import find_scenes
-from drake_clutter.commands.record_dataset import (
-    CameraOptions,
-    RecordingJob,
-    record_dataset,
-)
+from drake_clutter.commands.record_dataset import record_dataset
+from drake_clutter.commands.recording_job import CameraOptions, RecordingJob
 from drake_clutter.config import load_config
+from drake_clutter.recording.camera_recorder import CameraChannel
 from drake_clutter.reports.dataset_card import CARD_FILE, CONTACT_SHEET_FILE, FIGURES_FILE
 from training.script import Item, SeedOption, WorkersOption, progress, run_script
 
@@ -32,7 +32,11 @@ MAX_MOVES = 5
 """Largest number of moves of an episode: the first ones meet the scene as it was generated."""
 RATE = 30.0
 """Samples per second [Hz]."""
-CAMERAS = CameraOptions(("overhead",))
+CAMERAS = CameraOptions(
+    ("overhead",),
+    (CameraChannel.RGB, CameraChannel.DEPTH, CameraChannel.SEGMENTATION),
+    resolution=(320, 240),
+)
 COMMAND = "python training/record_sg_star_dataset.py --workers 2 --out FOLDER"
 
 

@@ -351,7 +351,8 @@ def _cloning() -> str:
         "a data set ([how to train them](../how_to/train_networks.md#reaching-policy)), control "
         f"the arm in the station at {1 / results['control_period_s']:g} Hz. *State*: sees the "
         "position of the object. *Depth*: sees the overhead depth image and the mask of the "
-        "object. *Reached*: the policy ends where the cup can attach to the object, which has not "
+        f"object. They learn from moves with the tool `{results['rows'][0]['tool']}`. *Reached*: "
+        "the policy ends where the cup can attach to the object, which has not "
         f"moved by more than {results['max_displacement_mm']:g} mm. Held-out moves are of other "
         "episodes.",
         command="python training/train_bc.py evaluate runs/bc_state runs/bc_depth --out FILE",

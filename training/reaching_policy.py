@@ -1,0 +1,111 @@
+"""Policy that reaches for a pick: a network from what it observes to a waypoint.
+
+Frames: T is the support, G is the tool, z out of it, O is the picked object.
+"""
+
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from drake_clutter.files import InputError
+from drake_clutter.learning.checkpoint import load_checkpoint
+from training.reaching_demonstrations import NEIGHBORHOOD
+
+CHECKPOINT_KIND = "reaching policy"
+"""Kind of the checkpoint."""
+LOOKAHEAD = 0.2
+"""Time to the waypoint that the policy predicts [s]."""
+
+
+class ReachingPolicy(nn.Module):
+    """Network from joint angles, tool pose and target to the change of the joint angles.
+
+    Attributes:
+        observation: `state` or `depth`.
+    """
+
+    def __init__(self, observation: str, num_joints: int) -> None:
+        """Create the network.
+
+        Args:
+            observation: `state` or `depth`.
+            num_joints: Number of joints of the arm.
+        """
+        super().__init__()
+        self.observation = observation
+        self.attention = nn.Sequential(
+            nn.Conv2d(3, 8, 3, padding=1),
+            nn.SiLU(),
+            nn.Conv2d(8, 8, 3, padding=1),
+            nn.SiLU(),
+            nn.Conv2d(8, 1, 1),
+        )
+        size = 256
+        self.head = nn.Sequential(
+            nn.Linear(num_joints - 1 + 4 + 3 * 3 + 2 * 2, size),
+            nn.SiLU(),
+            nn.Linear(size, size),
+            nn.SiLU(),
+            nn.Linear(size, size),
+            nn.SiLU(),
+            nn.Linear(size, num_joints - 1),
+        )
+        self.action_scale: Tensor
+        self.register_buffer("action_scale", torch.full((num_joints - 1,), 0.1))
+
+    def find_target(self, images: Tensor) -> Tensor:
+        """Return the target, of which the point is attended to. Shape (b, 4).
+
+        Args:
+            images: See `crop_image`. Shape (b, 4, CROP, CROP).
+        """
+        points, mask = images[:, :3], images[:, 3:]
+        visible = mask > 0
+        height = points[:, 2:]
+        lowest = torch.where(visible, height, torch.inf).amin(dim=(2, 3), keepdim=True)
+        highest = torch.where(visible, height, -torch.inf).amax(dim=(2, 3), keepdim=True)
+        shown = torch.cat([10 * (height - highest), 10 * (height - lowest), mask], dim=1)
+        logits = self.attention(shown).masked_fill(~visible, -torch.inf)
+        weights = logits.flatten(2).softmax(dim=2)
+        target = (points.flatten(2) * weights).sum(dim=2)
+        offsets = points - target.detach()[:, :, None, None]
+        is_near = ~visible & (offsets[:, :2].norm(dim=1, keepdim=True) <= NEIGHBORHOOD)
+        rise = torch.where(is_near, offsets[:, 2:], 0.0).amax(dim=(2, 3))
+        return torch.cat([target, rise], dim=1)
+
+    def forward(self, q: Tensor, p_TG: Tensor, axis: Tensor, target: Tensor) -> Tensor:
+        """Return the change of all joints but the last within `LOOKAHEAD` [rad].
+
+        Args:
+            q: Joint angles [rad]. Shape (b, n).
+            p_TG: Position of the tool [m]. Shape (b, 3).
+            axis: Axis of the tool in T. Shape (b, 3).
+            target: Point to reach and rise of its neighbors [m]. Shape (b, 4).
+        """
+        offset = target[:, :3] - p_TG
+        tilt = axis[:, :2]
+        features = [
+            q[:, :-1] / 2,
+            target / 0.3,
+            offset / 0.5,
+            torch.tanh(offset / 0.05),
+            torch.tanh(offset / 0.01),
+            tilt,
+            torch.tanh(tilt / 0.05),
+        ]
+        change: Tensor = self.head(torch.cat(features, dim=1)) * self.action_scale
+        return change
+
+    @staticmethod
+    def load(path: Path) -> "ReachingPolicy":
+        """Read a checkpoint."""
+        checkpoint = load_checkpoint(path)
+        if checkpoint.kind != CHECKPOINT_KIND:
+            raise InputError(f"{path}: kind: {checkpoint.kind}; expected {CHECKPOINT_KIND}")
+        policy = ReachingPolicy(
+            str(checkpoint.metadata["observation"]), int(checkpoint.metadata["num_joints"])
+        )
+        policy.load_state_dict(checkpoint.weights)
+        policy.eval()
+        return policy
