@@ -96,6 +96,21 @@ def test_an_object_that_the_arm_touches_is_in_contact() -> None:
     assert station.objects_in_contact(station.plant_context(root)) == {box.name, other.name}
 
 
+@pytest.mark.parametrize("name", ["ur10_epick_tray", "ur10_2f85_tray"])
+def test_joints_of_grippers_have_the_names_of_the_plant(name: str) -> None:
+    cell = load_cell(resource_path(f"models/cells/{name}.yaml"))
+    station = ClutterStation(cell, [], time_step=TIME_STEP)
+    plant, instance = station.plant, station.arm.gripper
+    names = plant.GetPositionNames(
+        instance, add_model_instance_prefix=False, always_add_suffix=False
+    )
+    assert list(cell.gripper.joint_names) == names
+    actuated = [
+        plant.get_joint_actuator(k).joint().name() for k in plant.GetJointActuatorIndices(instance)
+    ]
+    assert list(cell.gripper.joint_names[: cell.gripper.num_actuated_joints]) == actuated
+
+
 def test_forces_on_a_jaw_are_opposite_to_those_on_the_object() -> None:
     """The top of the box is 3 mm above the lowest corner of the tilted jaw.
 

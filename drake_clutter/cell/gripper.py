@@ -190,6 +190,10 @@ class Gripper(Protocol):
         """Tools by name; the first is preferred."""
 
     @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints of the model in which all parts can move, in order."""
+
+    @property
     def num_joints(self) -> int:
         """Number of joints of the model in which all parts can move."""
 

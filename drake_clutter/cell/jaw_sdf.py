@@ -30,6 +30,7 @@ _JAW_MASS = 0.05
 """Mass of a jaw [kg]; an assumption."""
 _COLORS = ("0.20 0.21 0.23 1", "0.70 0.71 0.73 1")
 _JAW_LINKS = ("left_jaw", "right_jaw")
+_JAW_JOINTS = ("left_jaw_guide", "right_jaw_guide")
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,11 @@ class JawGeometry:
     def jaw_links(self) -> tuple[str, str]:
         """Links of the left and the right jaw."""
         return _JAW_LINKS
+
+    @property
+    def jaw_joints(self) -> tuple[str, str]:
+        """Joints of the left and the right jaw."""
+        return _JAW_JOINTS
 
     @property
     def pad_size(self) -> Floats:
@@ -135,7 +141,7 @@ def _jaw_joint(geometry: JawGeometry, side: int, *, coupled: bool, movable: bool
     mimic = ""
     if coupled and side == 1:
         mimic = f"""
-        <mimic joint="{_JAW_LINKS[0]}_guide">
+        <mimic joint="{_JAW_JOINTS[0]}">
           <multiplier>1</multiplier><offset>0</offset><reference>0</reference>
         </mimic>"""
     axis = f"""
@@ -148,7 +154,7 @@ def _jaw_joint(geometry: JawGeometry, side: int, *, coupled: bool, movable: bool
         </limit>{mimic}
       </axis>"""
     return f"""
-    <joint name="{link}_guide" type="{"prismatic" if movable else "fixed"}">
+    <joint name="{_JAW_JOINTS[side]}" type="{"prismatic" if movable else "fixed"}">
       <parent>body</parent>
       <child>{link}</child>{axis if movable else ""}
     </joint>"""

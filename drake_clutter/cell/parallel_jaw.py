@@ -87,6 +87,11 @@ class ParallelJawGripper(StrictModel):
         return {JAWS: Tool(JAWS, JAWS, geometry.X_FG, geometry.jaw_links, None)}
 
     @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Guides of the left and the right jaw."""
+        return self.geometry.jaw_joints
+
+    @property
     def num_joints(self) -> int:
         """Both jaws."""
         return 2

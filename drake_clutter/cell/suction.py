@@ -187,9 +187,14 @@ class SuctionGripper(StrictModel):
         return final_vacuum + (vacuum - final_vacuum) * math.exp(-rate * duration)
 
     @property
-    def num_joints(self) -> int:
+    def joint_names(self) -> tuple[str, ...]:
         """Extension of the bellows and two angles of bending, of each cup."""
-        return sum(len(cup.joints) for cup in self.cups)
+        return tuple(joint for cup in self.cups for joint in cup.joints)
+
+    @property
+    def num_joints(self) -> int:
+        """Three of each cup."""
+        return len(self.joint_names)
 
     @property
     def num_actuated_joints(self) -> int:
