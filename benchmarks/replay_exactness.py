@@ -31,6 +31,7 @@ from drake_clutter.recording.exact_replay import (
     replay_action,
 )
 from drake_clutter.recording.hdf5_file import load_episode, save_episode
+from drake_clutter.recording.recorded_episode import EpisodeHeader
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.station.motion_recorder import DEFAULT_RATE
 from drake_clutter.statistics import wilson_interval
@@ -121,10 +122,7 @@ class EpisodeReplayer:
             scenes.settled_scene(number, scenes.grammar, self._config),
             self._make_policy,
             self._config,
-            seed=self._seed,
-            index=number,
-            policy_name=self._agent,
-            rate=self._rate,
+            EpisodeHeader(self._agent, self._seed, number, rate=self._rate),
             max_moves=MOVES_PER_EPISODE,
         )
         with TemporaryDirectory() as folder:

@@ -95,10 +95,12 @@ from .feasibility.move_study import FeasibilityStudy as FeasibilityStudy
 from .recording.episode_recorder import record_episode as record_episode
 from .recording.exact_replay import (
     compare_samples as compare_samples,
+    recorded_physics as recorded_physics,
     replay_action as replay_action,
 )
 from .recording.hdf5_file import load_episode as load_episode, save_episode as save_episode
 from .recording.recorded_episode import (
+    EpisodeHeader as EpisodeHeader,
     RecordedAction as RecordedAction,
     RecordedEpisode as RecordedEpisode,
 )
@@ -110,10 +112,10 @@ from .recording.formats.dataset_format import (
 )
 from .recording.randomization import RandomizationConfig as RandomizationConfig
 from .commands.episode_scenes import find_scenes as find_scenes
-from .commands.record_dataset import (
+from .commands.record_dataset import record_dataset as record_dataset
+from .commands.recording_job import (
     CameraOptions as CameraOptions,
     RecordingJob as RecordingJob,
-    record_dataset as record_dataset,
 )
 
 # The closed loop.

@@ -23,7 +23,11 @@ from drake_clutter.recording.episode_recorder import (
 )
 from drake_clutter.recording.exact_replay import compare_samples, replay_action
 from drake_clutter.recording.hdf5_file import load_episode, save_episode
-from drake_clutter.recording.recorded_episode import RecordedAction, RecordedEpisode
+from drake_clutter.recording.recorded_episode import (
+    EpisodeHeader,
+    RecordedAction,
+    RecordedEpisode,
+)
 from drake_clutter.reports.recording import motion_frames, replay_frames
 from drake_clutter.scenes.interfaces import Move, MoveResult, Observation, Outcome
 from drake_clutter.tasks.belief import Belief, Decision, Policy
@@ -56,10 +60,7 @@ def record(
         SCENE,
         lambda _: given_moves(moves),
         replace(config, cell=CELL),
-        seed=3,
-        policy_name="given",
-        index=2,
-        scene_name="pile",
+        EpisodeHeader("given", seed=3, index=2, scene_name="pile"),
         max_moves=3,
         stop_when_all_found=False,
         on_action=seen.append,

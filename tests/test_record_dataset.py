@@ -1,6 +1,7 @@
 """Data sets of recorded episodes: resumed, reproducible, and whole whatever happens."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +12,15 @@ from typer.testing import CliRunner
 
 from drake_clutter.cli.app import app
 from drake_clutter.commands.episode_scenes import FileScenes, find_scenes
-from drake_clutter.commands.record_dataset import (
-    CameraOptions,
-    EpisodeSummary,
-    RecordingJob,
-    episode_path,
-    record_dataset,
-)
+from drake_clutter.commands.record_dataset import EpisodeSummary, episode_path, record_dataset
+from drake_clutter.commands.recording_job import CameraOptions, RecordingJob
 from drake_clutter.files import InputError
 from drake_clutter.recording.camera_recorder import CameraChannel
+from drake_clutter.recording.exact_replay import (
+    compare_samples,
+    recorded_physics,
+    replay_action,
+)
 from drake_clutter.recording.hdf5_file import load_episode
 from drake_clutter.recording.randomization import load_randomization
 from drake_clutter.scenes.interfaces import Move, MoveResult, Observation
@@ -107,6 +108,23 @@ def test_episodes_hold_what_the_job_asked_for(job: RecordingJob, dataset: Path) 
         assert held.any()
     masses = [e.variation["mass"]["far"] for e in episodes]
     assert masses[0] != masses[1]
+
+
+def test_an_episode_with_other_masses_is_replayed(dataset: Path) -> None:
+    episode = load_episode(episode_path(dataset, 0), CATALOG)
+    samples = episode.actions[0].samples
+    assert samples is not None
+    with recorded_physics(episode) as scene:
+        assert scene["box"].object_class.mass == episode.variation["mass"]["box"]
+        replayed = replay_action(scene, episode.cell, samples, episode.rate)
+    errors = compare_samples(samples, replayed)
+    assert (errors.joint, errors.object) == (0.0, 0.0)
+    # The motors notice the nominal mass.
+    nominal = replay_action(episode.initial_scene, episode.cell, samples, episode.rate)
+    assert compare_samples(samples, nominal).joint > 1e-6
+    broken = replace(episode, variation={"mass": {"box": -1.0}})
+    with pytest.raises(InputError, match=r"mass.*: -1.0"), recorded_physics(broken):
+        pass
 
 
 def test_a_missing_episode_is_recorded_again_with_the_same_bytes(

@@ -145,12 +145,8 @@ def record(
     """
     from drake_clutter.commands.episode_scenes import FileScenes, find_scenes
     from drake_clutter.commands.explore_scene import read_moves
-    from drake_clutter.commands.record_dataset import (
-        CameraOptions,
-        EpisodeSummary,
-        RecordingJob,
-        record_dataset,
-    )
+    from drake_clutter.commands.record_dataset import EpisodeSummary, record_dataset
+    from drake_clutter.commands.recording_job import CameraOptions, RecordingJob
     from drake_clutter.recording.camera_recorder import CameraChannel
     from drake_clutter.recording.formats.dataset_format import DatasetFormat
     from drake_clutter.recording.randomization import load_randomization

@@ -23,6 +23,7 @@ from drake_clutter.planning.plan_export import (
 )
 from drake_clutter.recording.episode_recorder import make_recorded_episode
 from drake_clutter.recording.hdf5_file import action_name, save_episode
+from drake_clutter.recording.recorded_episode import EpisodeHeader
 from drake_clutter.reports.episode_page import write_episode_page
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.interfaces import Move, Observation
@@ -322,10 +323,8 @@ def write_episode(
             task.initial_scene,
             cell,
             task.transitions,
-            policy_name=agent,
+            EpisodeHeader(agent, seed, scene_name=title),
             termination=fields["termination"],
-            seed=seed,
-            scene_name=title,
         )
         save_episode(out / TRAJECTORY_FILE, episode)
     fields["cell"] = to_plain(cell)

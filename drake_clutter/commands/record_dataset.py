@@ -7,7 +7,7 @@ an episode depends only on the job and on its number, not on the number of worke
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -15,49 +15,31 @@ from typing import Any, Protocol, TypeVar
 import h5py
 import numpy as np
 
-import drake_clutter
-from drake_clutter.agents.explorers import (
-    PRETRAINED_EXPLORERS,
-    PolicyFactory,
-    make_policy_factory,
-)
 from drake_clutter.catalog import load_catalog
-from drake_clutter.commands.episode_scenes import SceneSource
-from drake_clutter.commands.explore_scene import move_list_policy
 from drake_clutter.commands.job_file import open_job_folder
-from drake_clutter.config import ClutterConfig
+from drake_clutter.commands.recording_job import RANDOM, RecordingJob
 from drake_clutter.files import InputError, reading_file, write_json
-from drake_clutter.learning.pretrained import checkpoint_sha256
 from drake_clutter.recording.appearance import NUM_LIGHTS, colored_parts
-from drake_clutter.recording.camera_recorder import (
-    CameraChannel,
-    CameraRecorder,
-    RecordedCamera,
-    find_cameras,
-)
+from drake_clutter.recording.camera_recorder import CameraRecorder
 from drake_clutter.recording.episode_recorder import record_episode
 from drake_clutter.recording.formats.dataset_format import (
     DatasetFormat,
     check_format,
     convert_episodes,
 )
-from drake_clutter.recording.hdf5_file import FORMAT_VERSION, load_episode, save_episode
+from drake_clutter.recording.hdf5_file import load_episode, save_episode
 from drake_clutter.recording.randomization import (
-    RandomizationConfig,
     Variation,
     draw_variation,
     varied_physics,
     vary_poses,
 )
-from drake_clutter.recording.recorded_episode import RecordedEpisode
+from drake_clutter.recording.recorded_episode import EpisodeHeader, RecordedEpisode
 from drake_clutter.reports.dataset_card import CardText, write_card
-from drake_clutter.scenes.interfaces import Move, MoveResult
+from drake_clutter.scenes.interfaces import MoveResult
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.drake_judge import DrakeJudge
-from drake_clutter.station.motion_recorder import DEFAULT_RATE
-from drake_clutter.tasks.belief import Policy
-from drake_clutter.validation import to_plain
 from drake_clutter.workers.parallel_map import map_ordered
 
 Item = TypeVar("Item")
@@ -65,119 +47,10 @@ Item = TypeVar("Item")
 EPISODES_FOLDER = "episodes"
 """Folder of the recorded episodes in that of a data set."""
 SUMMARY_FILE = "summary.json"
-RANDOM = "random"
-"""Name of the policy of random legal moves."""
 MAX_PHYSICS_ATTEMPTS = 10
 """Number of drawn masses and frictions with which a scene may be unstable, one after the other."""
 _VARIATION, _POSES, _NOISE = range(1, 4)
 """Last elements of the paths of an episode's random generators, beside that of `record_episode`."""
-
-
-@dataclass(frozen=True)
-class CameraOptions:
-    """Which images are recorded.
-
-    Attributes:
-        names: Names of the cameras; see `find_cameras`. None are rendered without names.
-        channels: Kinds of images.
-        resolution: Width and height [px]; None for those of each camera.
-        rate: Images per second [Hz].
-    """
-
-    names: tuple[str, ...] = ()
-    channels: tuple[CameraChannel, ...] = (CameraChannel.RGB, CameraChannel.DEPTH)
-    resolution: tuple[int, int] | None = None
-    rate: float = 10.0
-
-    def find(self, config: ClutterConfig) -> tuple[RecordedCamera, ...]:
-        """Return the cameras in the cell of a configuration."""
-        return find_cameras(config.cell, self.names, self.resolution)
-
-
-@dataclass(frozen=True)
-class RecordingJob:
-    """Everything that determines a data set but the number of its episodes.
-
-    Attributes:
-        scenes: Scenes of the episodes.
-        policy: Name of an exploration policy, see `make_policy_factory`; a list of moves, which are
-            attempted in every scene; or a function. The episodes of explorers end when every
-            object has been seen, those of `RANDOM`, lists and functions do not.
-        config: Configuration of the simulated world.
-        seed: Seed of policies, placements, simulation and randomization.
-        rate: Samples per second [Hz].
-        max_moves: Largest number of moves of an episode; None for that of the configuration.
-        cameras: Which images are recorded.
-        randomization: What is varied from episode to episode.
-        catalog_folder: Asset folder with the user's object classes, or None.
-    """
-
-    scenes: SceneSource
-    policy: str | tuple[Move, ...] | Policy
-    config: ClutterConfig
-    seed: int = 0
-    rate: float = DEFAULT_RATE
-    max_moves: int | None = None
-    cameras: CameraOptions = field(default_factory=CameraOptions)
-    randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
-    catalog_folder: Path | None = None
-
-    @property
-    def policy_name(self) -> str:
-        """Name of the policy."""
-        if isinstance(self.policy, str):
-            return self.policy
-        if isinstance(self.policy, tuple):
-            return "moves"
-        return getattr(self.policy, "__qualname__", type(self.policy).__qualname__)
-
-    def make_policy_factory(self) -> PolicyFactory:
-        """Return the factory of the policies of the episodes.
-
-        Raises:
-            InputError: There is no such policy, or it does not know the classes of the scenes.
-        """
-        policy = self.policy
-        if isinstance(policy, str):
-            return make_policy_factory(policy, self.config, self.scenes.classes)
-        if isinstance(policy, tuple):
-            return partial(move_list_policy, policy)
-        return lambda _: policy
-
-    def check(self) -> None:
-        """Raise an InputError if the policy or a camera does not exist."""
-        self.make_policy_factory()
-        self.cameras.find(self.config)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything that determines the data set, for JSON."""
-        moves = [asdict(move) for move in self.policy] if isinstance(self.policy, tuple) else None
-        weights = (
-            checkpoint_sha256(self.policy, PRETRAINED_EXPLORERS)
-            if isinstance(self.policy, str)
-            else None
-        )
-        return {
-            "command": "record",
-            "version": FORMAT_VERSION,
-            "package_version": drake_clutter.__version__,
-            "scenes": self.scenes.to_dict(),
-            "policy": self.policy_name,
-            "weights": weights,
-            "moves": moves,
-            "seed": self.seed,
-            "rate": self.rate,
-            "max_moves": self.max_moves,
-            "cameras": {
-                "names": [*self.cameras.names],
-                "channels": [channel.value for channel in self.cameras.channels],
-                "resolution": self.cameras.resolution and [*self.cameras.resolution],
-                "rate": self.cameras.rate,
-            },
-            "randomization": to_plain(self.randomization),
-            "catalog_folder": str(self.catalog_folder.resolve()) if self.catalog_folder else None,
-            "config": to_plain(self.config),
-        }
 
 
 @dataclass(frozen=True)
@@ -262,11 +135,7 @@ class EpisodeWriter:
                     scene,
                     self._make_policy,
                     job.config,
-                    seed=job.seed,
-                    policy_name=job.policy_name,
-                    index=index,
-                    scene_name=name,
-                    rate=job.rate,
+                    EpisodeHeader(job.policy_name, job.seed, index, name, job.rate),
                     max_moves=job.max_moves,
                     stop_when_all_found=isinstance(job.policy, str) and job.policy != RANDOM,
                 )

@@ -8,7 +8,7 @@ from drake_clutter.assets.contact_properties import ROLLING_FRICTION, SURFACE_FR
 from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.cell.support import Support
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.export.cell_model import read_cell_model
+from drake_clutter.export.cell_reader import read_cell_model
 from drake_clutter.export.mjcf_cell import CellWriter
 from drake_clutter.export.model_parts import (
     can_roll,

@@ -36,8 +36,8 @@ from drake_clutter.export.cell_model import (
     CellCamera,
     CellJoint,
     CellModel,
-    read_cell_model,
 )
+from drake_clutter.export.cell_reader import read_cell_model
 from drake_clutter.export.model_parts import (
     Inertial,
     classes_in_scene,

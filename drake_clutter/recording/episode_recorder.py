@@ -2,7 +2,8 @@
 
 config = load_config()
 make_policy = make_policy_factory("largest-clear", config)
-episode = record_episode(scene, make_policy, config, seed=0, policy_name="largest-clear")
+header = EpisodeHeader("largest-clear", seed=0)
+episode = record_episode(scene, make_policy, config, header)
 save_episode(Path("episode.h5"), episode)
 """
 
@@ -18,12 +19,15 @@ from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.pick_place_plan import PlanningFailureReason
-from drake_clutter.recording.recorded_episode import RecordedAction, RecordedEpisode
+from drake_clutter.recording.recorded_episode import (
+    EpisodeHeader,
+    RecordedAction,
+    RecordedEpisode,
+)
 from drake_clutter.scenes.interfaces import MoveResult, Observation
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.station.arm_executor import ArmExecutor
-from drake_clutter.station.motion_recorder import DEFAULT_RATE
 from drake_clutter.tasks.belief import Belief, Decision, Policy
 from drake_clutter.tasks.episode import SteppedBackend, run_episode
 from drake_clutter.tasks.exploration_task import TerminationReason, Transition
@@ -40,12 +44,8 @@ def record_episode(
     scene: Scene,
     make_policy: PolicyFactory,
     config: ClutterConfig,
+    header: EpisodeHeader,
     *,
-    seed: int,
-    policy_name: str,
-    index: int = 0,
-    scene_name: str = "",
-    rate: float = DEFAULT_RATE,
     max_moves: int | None = None,
     stop_when_all_found: bool = True,
     on_action: Callable[[RecordedAction], None] = lambda _: None,
@@ -58,21 +58,17 @@ def record_episode(
         scene: Scene at rest.
         make_policy: Creates the policy that chooses the moves.
         config: Configuration.
-        seed: Seed of the data set.
-        policy_name: Name of the policy.
-        index: Number of the episode, which has random numbers of its own.
-        scene_name: Name of the scene.
-        rate: Samples per second [Hz].
+        header: Names, rate and seed; each number of an episode has random numbers of its own.
         max_moves: Largest number of moves; None for that of the configuration.
         stop_when_all_found: Whether the episode ends when every object has been seen.
         on_action: Called after each attempted move.
     """
     backend = SteppedBackend(
-        ArmExecutor(config, rate=rate),
+        ArmExecutor(config, rate=header.rate),
         LabelDetector(config.cell.camera),
         config.exploration,
         scene,
-        item_rng(seed, index),
+        item_rng(header.seed, header.index),
     )
     believed = list[dict[str, Pose]]()
     transitions = list[Transition]()
@@ -95,16 +91,7 @@ def record_episode(
     except _PolicyError as raised:
         error, termination = str(raised), POLICY_ERROR
     episode = make_recorded_episode(
-        scene,
-        config.cell,
-        transitions,
-        policy_name=policy_name,
-        termination=termination,
-        seed=seed,
-        index=index,
-        scene_name=scene_name,
-        rate=rate,
-        believed=believed,
+        scene, config.cell, transitions, header, termination=termination, believed=believed
     )
     return replace(episode, error=error)
 
@@ -144,13 +131,9 @@ def make_recorded_episode(
     scene: Scene,
     cell: WorkCell,
     transitions: Sequence[Transition],
+    header: EpisodeHeader,
     *,
-    policy_name: str,
     termination: str,
-    seed: int,
-    index: int = 0,
-    scene_name: str = "",
-    rate: float = DEFAULT_RATE,
     believed: Sequence[Mapping[str, Pose]] = (),
 ) -> RecordedEpisode:
     """Return the record of an episode that was run at fidelity `arm`.
@@ -159,12 +142,8 @@ def make_recorded_episode(
         scene: Scene before the first move.
         cell: Work cell.
         transitions: Attempted moves.
-        policy_name: Name of the policy.
+        header: Names, rate and seed.
         termination: Why the episode ended.
-        seed: Seed of the data set or the episode.
-        index: Number of the episode.
-        scene_name: Name of the scene.
-        rate: Samples per second [Hz].
         believed: Poses X_TO of the belief before each move, by name; empty if unknown.
     """
     tools = tuple(cell.gripper.tools)
@@ -177,12 +156,12 @@ def make_recorded_episode(
         initial_scene=scene,
         cell=cell.with_support(scene.support),
         actions=tuple(actions),
-        policy=policy_name,
+        policy=header.policy,
         termination=termination,
-        seed=seed,
-        index=index,
-        scene_name=scene_name,
-        rate=rate,
+        seed=header.seed,
+        index=header.index,
+        scene_name=header.scene_name,
+        rate=header.rate,
         package_version=drake_clutter.__version__,
         drake_version=version("drake"),
     )

@@ -1,10 +1,12 @@
 """Exact replay: the recorded commands of an action through the simulated station.
 
-replayed = replay_action(scene, episode.cell, action.samples, episode.rate)
+with recorded_physics(episode) as scene:
+    replayed = replay_action(scene, episode.cell, action.samples, episode.rate)
 errors = compare_samples(action.samples, replayed)
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -15,6 +17,8 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.files import InputError
 from drake_clutter.planning.motion_plan import CellState, MotionPlan, PlanStep, stay_at
+from drake_clutter.recording.randomization import Variation, varied_physics
+from drake_clutter.recording.recorded_episode import RecordedEpisode
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.action_samples import PHASES, ActionSamples, ExecutedCommands
 from drake_clutter.scenes.scene import Pose, Scene
@@ -52,6 +56,22 @@ class ReplayErrors:
         return self.joint <= MAX_JOINT_ERROR and self.object <= MAX_OBJECT_ERROR
 
 
+@contextmanager
+def recorded_physics(episode: RecordedEpisode) -> Iterator[Scene]:
+    """Yield the initial scene with the masses and friction of the recording.
+
+    Its classes exist until the block ends, see `varied_physics`.
+
+    Args:
+        episode: Recorded episode.
+
+    Raises:
+        InputError: `RecordedEpisode.variation` has a value that is not allowed.
+    """
+    with varied_physics(episode.initial_scene, Variation.from_dict(episode.variation)) as scene:
+        yield scene
+
+
 def scene_at(scene: Scene, samples: ActionSamples, index: int) -> Scene:
     """Return a scene with the object poses of a sample.
 
@@ -74,7 +94,7 @@ def replay_action(
     """Return the samples of a replayed action, in a simulation as that of the recording.
 
     Args:
-        scene: Scene of the episode, for names and classes.
+        scene: Scene of the episode, for names and classes; see `recorded_physics`.
         cell: Work cell.
         samples: Recorded samples.
         rate: Samples per second [Hz].

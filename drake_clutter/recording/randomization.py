@@ -31,6 +31,7 @@ from drake_clutter.validation import (
     StrictModel,
     allowed_error,
     load_config_as,
+    validate,
 )
 
 Floats = NDArray[np.float64]
@@ -181,8 +182,8 @@ class Variation:
         color_noise: Standard deviation of the noise of color images [8-bit levels].
     """
 
-    mass: Mapping[str, float] = field(default_factory=dict)
-    friction: Mapping[str, float] = field(default_factory=dict)
+    mass: Mapping[str, Positive] = field(default_factory=dict)
+    friction: Mapping[str, Positive] = field(default_factory=dict)
     lights: tuple[LightVariation, ...] = ()
     colors: Mapping[str, Vector] = field(default_factory=dict)
     color_fraction: float = 0.0
@@ -193,6 +194,15 @@ class Variation:
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for JSON."""
         return asdict(self)
+
+    @staticmethod
+    def from_dict(values: Mapping[str, Any]) -> "Variation":
+        """Return the variation of a recorded episode; without fields, that of none.
+
+        Raises:
+            InputError: A field has a value that is not allowed.
+        """
+        return validate(Variation, dict(values), "variation")
 
     def camera_error(self, name: str) -> RigidTransform:
         """Return X_CC' of a camera; see `CameraVariation`."""

@@ -17,6 +17,7 @@ from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.action_samples import POSE_COLUMNS, ActionSamples
 from drake_clutter.scenes.interfaces import Move, MoveResult
 from drake_clutter.scenes.scene import Pose, Scene
+from drake_clutter.station.motion_recorder import DEFAULT_RATE
 
 Floats = NDArray[np.float64]
 
@@ -74,6 +75,25 @@ class RecordedAction:
     believed: Mapping[str, Pose] = field(default_factory=dict, repr=False)
 
 
+@dataclass(frozen=True)
+class EpisodeHeader:
+    """What is known of an episode before it is recorded.
+
+    Attributes:
+        policy: Name of the policy.
+        seed: Seed of the data set or of the episode.
+        index: Number of the episode in the data set.
+        scene_name: Name of the scene.
+        rate: Samples per second [Hz].
+    """
+
+    policy: str
+    seed: int
+    index: int = 0
+    scene_name: str = ""
+    rate: float = DEFAULT_RATE
+
+
 @dataclass(frozen=True, eq=False)
 class RecordedEpisode:
     """An episode with the arm.
@@ -114,14 +134,14 @@ class RecordedEpisode:
         gripper = self.cell.gripper
         tools = tuple(gripper.tools)
         joints = load_robot(self.cell.robot).joint_names
-        actuators = tuple(f"gripper_{k}" for k in range(gripper.num_actuated_joints))
+        actuators = gripper.joint_names[: gripper.num_actuated_joints]
         kinds = ("position", "velocity", "torque")
         return {
             "joints": joints,
             "commands": (*(f"{name} {kind}" for kind in kinds for name in joints), *actuators),
             "tools": tools,
             "cups": tools if isinstance(gripper, SuctionGripper) else (),
-            "gripper_joints": tuple(f"gripper_{k}" for k in range(gripper.num_joints)),
+            "gripper_joints": gripper.joint_names,
             "gripper_actuators": actuators,
             "objects": self.initial_scene.names,
             "pose": POSE_COLUMNS,
