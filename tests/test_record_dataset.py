@@ -119,9 +119,9 @@ def test_an_episode_with_other_masses_is_replayed(dataset: Path) -> None:
         replayed = replay_action(scene, episode.cell, samples, episode.rate)
     errors = compare_samples(samples, replayed)
     assert (errors.joint, errors.object) == (0.0, 0.0)
-    # The motors notice the nominal mass.
+    # With the nominal mass, the bellows extend by another distance.
     nominal = replay_action(episode.initial_scene, episode.cell, samples, episode.rate)
-    assert compare_samples(samples, nominal).joint > 1e-6
+    assert compare_samples(samples, nominal).object > 1e-4
     broken = replace(episode, variation={"mass": {"box": -1.0}})
     with pytest.raises(InputError, match=r"mass.*: -1.0"), recorded_physics(broken):
         pass

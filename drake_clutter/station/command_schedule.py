@@ -49,6 +49,11 @@ class CommandSchedule:
         return next((start for start, step in starts if step.tool), math.inf)
 
     @property
+    def held_time(self) -> float:
+        """Time from which a tool holds its object [s]: jaws close first."""
+        return self.grasp_time + (JAW_MOVING_TIME if self.num_actuated else 0.0)
+
+    @property
     def release_time(self) -> float:
         """Time at which an object is first released [s]; infinite if none is."""
         return self.start_of("release")

@@ -309,7 +309,7 @@ class StationSimulation:
             elapsed = self.root.get_time() - state.start_time - state.waited
             required = bodies_to_wake(state.schedule, self._affected, elapsed)
             end = state.schedule.end_time + POST_MOTION_WAIT
-            expects_grasp = state.schedule.grasp_time + STEP_PERIOD <= elapsed < end
+            expects_grasp = state.schedule.held_time + STEP_PERIOD <= elapsed < end
         self._sleep.update(self.root, required, self.gripper.status, expects_grasp=expects_grasp)
         start = self._num_steps * STEP_PERIOD + _TIME_MARGIN
         for k in range(_GRIPPER_UPDATES_PER_STEP):
