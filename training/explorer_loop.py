@@ -49,5 +49,9 @@ def train_explorer(
         evaluate_every=evaluate_every,
         save_every=evaluate_every,
     )
-    network_metadata = explorer_metadata(environment.node_kind_ids, learner.config.width)
+    network_metadata = explorer_metadata(
+        environment.node_kind_ids,
+        learner.config.width,
+        finds_target=environment.target_text is not None,
+    )
     run.finish(CHECKPOINT_FILE, learner.network, {"kind": kind, "network": network_metadata})

@@ -70,6 +70,9 @@ def main(
             f"teacher: {path} knows {', '.join(numbers)}; expected a teacher of the object"
             f" classes in {training.scenes}"
         )
+    if teacher.finds_target != bool(training.target):
+        wanted = "a target" if training.target else "all objects"
+        raise InputError(f"teacher: {path}: looks for something else; expected one for {wanted}")
     learner = BehaviorCloningLearner(
         environment, teacher.to(torch_device), training.learning, training.seed, torch_device
     )

@@ -79,7 +79,10 @@ def main(
                 f"warm_start: {path}: has other object classes or another width; expected a"
                 " checkpoint with the same"
             )
-        learner.network.load_state_dict(network.state_dict())
+        if network.finds_target and not training.target:
+            raise InputError(f"warm_start: {path}: looks for one object; expected a target")
+        # Without training, a network that is conditioned on a target acts as the same without one.
+        learner.network.load_state_dict(learner.network.state_dict() | network.state_dict())
     train_explorer(
         out,
         training,

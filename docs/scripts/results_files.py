@@ -32,6 +32,8 @@ POLICIES = {
     "student_14_dagger": "SE-14, DAgger",
     "student_bc": "SE\\*, cloning",
     "full-knowledge": "oracle",
+    "area-reduction": "area",
+    "student-target": "SE, target",
     "student_seed_1": "SE\\*, seed 1",
     "student_seed_2": "SE\\*, seed 2",
 }

@@ -19,6 +19,7 @@ from drake_clutter.seeding import item_rng
 from drake_clutter.statistics import mean_interval, ratio_interval, wilson_interval
 from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration_task import TerminationReason
+from drake_clutter.tasks.search_target import require_target
 
 _FAILED_MOVES = {reason.value for reason in TerminationReason if reason.is_failed_move}
 """How episodes end that count as collapsed: an object may have left the support."""
@@ -33,12 +34,14 @@ class EpisodeSpec:
         scene_index: Index of the scene in the dataset; None for a scene file.
         agent: See `make_policy_factory`.
         index: Index of the episode, from which its random generator is seeded.
+        target: What the episode looks for, see `find_target`; "" for all objects.
     """
 
     file: Path
     scene_index: int | None
     agent: str
     index: int
+    target: str = ""
 
     @property
     def scene(self) -> str:
@@ -116,13 +119,20 @@ class EpisodeRunner:
 
     def __call__(self, episode: EpisodeSpec) -> EpisodeResult:
         """Run an episode; the result depends only on it and the arguments of the constructor."""
-        if episode.agent not in self._policy_factories:
-            factory = make_policy_factory(episode.agent, self._config)
-            self._policy_factories[episode.agent] = factory
         rng = item_rng(self._seed, episode.index)
         backend = self._make_backend(self._load_scene(episode), rng)
-        policy = self._policy_factories[episode.agent](backend)
-        task = run_episode(backend, policy, max_moves=self._max_moves)
+        target = None
+        if episode.target:
+            in_view = [d.name for d in backend.perception.observation.detections]
+            target = require_target(episode.target, backend.scene, in_view, rng)
+            factory = make_policy_factory(episode.agent, self._config, target=target)
+        else:
+            if episode.agent not in self._policy_factories:
+                self._policy_factories[episode.agent] = make_policy_factory(
+                    episode.agent, self._config
+                )
+            factory = self._policy_factories[episode.agent]
+        task = run_episode(backend, factory(backend), max_moves=self._max_moves, target=target)
         transitions = task.transitions
         found_after = np.cumsum([len(t.newly_found) for t in transitions], dtype=int)
         return EpisodeResult(

@@ -46,6 +46,8 @@ def collate_graphs(observations: Sequence[ExplorationObservation]) -> Exploratio
         "global_features": (len(GLOBAL_FEATURES),),
         "action_mask": (nodes, nodes),
     }
+    if "target_kind" in observations[0]:
+        shapes |= {"target_kind": (1,), "is_target": (nodes,)}
     batch = {
         name: np.zeros((len(observations), *shape), observations[0][name].dtype)
         for name, shape in shapes.items()
@@ -101,12 +103,14 @@ class ExplorerNetwork(RenamedParameters):
         "value": "value_head",
     }
 
-    def __init__(self, num_node_kinds: int, width: int = 32) -> None:
+    def __init__(self, num_node_kinds: int, width: int = 32, *, finds_target: bool = False) -> None:
         """Create a network.
 
         Args:
             num_node_kinds: Number of object classes, plus one for the tray.
             width: Width H of the embeddings.
+            finds_target: Whether the policy is conditioned on a target. Before training, it acts
+                as the same network without a target.
         """
         super().__init__()
         self.encoder = GraphNetwork(
@@ -118,6 +122,11 @@ class ExplorerNetwork(RenamedParameters):
         self.place_head = nn.Linear(width, 1)
         self.value_head = nn.Linear(width, 1)
         nn.init.normal_(self.pick_marker, std=1.0)
+        self.finds_target = finds_target
+        if finds_target:
+            self.target_embedding = nn.Embedding(num_node_kinds, width)
+            self.target_marker = nn.Parameter(torch.zeros(width))
+            nn.init.zeros_(self.target_embedding.weight)
 
     def make_batch(self, observation: Mapping[str, NDArray[Any]]) -> tuple[GraphBatch, Tensor]:
         """Return the input of the encoder, and each node's index within its graph (M,).
@@ -150,7 +159,7 @@ class ExplorerNetwork(RenamedParameters):
             observation: A batch of `collate_graphs`.
         """
         batch, node_index = self.make_batch(observation)
-        nodes, globals_ = self.encoder(batch)
+        nodes, globals_ = self.encoder(batch, *self._target_offsets(observation, batch, node_index))
         action_mask = torch.from_numpy(observation["action_mask"]).to(nodes.device) > 0
         pick_log_probs = _masked_log_softmax(
             self.pick_head(nodes).squeeze(1),
@@ -160,6 +169,24 @@ class ExplorerNetwork(RenamedParameters):
         )
         encoding = GraphEncoding(nodes, globals_, batch, node_index, action_mask)
         return PolicyOutput(pick_log_probs, self.value_head(globals_).squeeze(1), encoding)
+
+    def _target_offsets(
+        self, observation: Mapping[str, NDArray[Any]], batch: GraphBatch, node_index: Tensor
+    ) -> tuple[Tensor | None, Tensor | None]:
+        """Return what the target adds to nodes (M, H) and graphs (B, H); None without a target.
+
+        Args:
+            observation: A batch of `collate_graphs`.
+            batch: See `make_batch`.
+            node_index: See `make_batch`.
+        """
+        if not self.finds_target:
+            return None, None
+        device = node_index.device
+        kind = torch.from_numpy(observation["target_kind"][:, 0].astype(np.int64)).to(device)
+        is_target = torch.from_numpy(observation["is_target"]).to(device)
+        marked = is_target[batch.connectivity.node_graph, node_index]
+        return marked[:, None] * self.target_marker, self.target_embedding(kind - 1)
 
     def place_log_probs(self, output: PolicyOutput, picked: Tensor) -> Tensor:
         """Return the log-probability of each node as the place; -inf if not allowed.

@@ -33,6 +33,7 @@ class ExplorerTrainingConfig:
         max_moves: Maximum number of moves of an episode.
         max_objects: Maximum number of objects of a scene.
         evaluation_episodes: Number of episodes of an evaluation.
+        target: What an episode looks for, see `ClutterExploration`; "" for all objects.
         world: Configuration of the simulated world.
     """
 
@@ -43,6 +44,7 @@ class ExplorerTrainingConfig:
     max_moves: Count = 20
     max_objects: Annotated[int, InRange(1, 64)] = 24
     evaluation_episodes: Count = 200
+    target: str = ""
     world: ClutterConfig = field(default_factory=ClutterConfig)
 
     def make_environment(self, *, privileged: bool = False) -> ClutterExploration:
@@ -60,6 +62,7 @@ class ExplorerTrainingConfig:
             config=self.world,
             max_moves=self.max_moves,
             max_objects=self.max_objects,
+            target=self.target or None,
         )
 
     def evaluate(

@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 
+from drake_clutter.agents.area_reduction import AreaReductionExplorer
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.pretrained import checkpoint_path
@@ -16,6 +17,7 @@ from drake_clutter.scenes.scene import TRAY
 from drake_clutter.tasks.belief import Belief, Decision, Policy, legal_moves
 from drake_clutter.tasks.episode import Backend
 from drake_clutter.tasks.oracle_search import OracleSearch
+from drake_clutter.tasks.search_target import SearchTarget
 
 
 def random_explorer(belief: Belief, observation: Observation, rng: np.random.Generator) -> Decision:
@@ -79,13 +81,17 @@ class OracleExplorer:
     BUDGET = 2000
     """Maximum number of moves that are evaluated in the search for a plan."""
 
-    def __init__(self, backend: Backend, search: OracleSearch) -> None:
+    def __init__(
+        self, backend: Backend, search: OracleSearch, target: SearchTarget | None = None
+    ) -> None:
         """Create the policy of an episode.
 
         Args:
             backend: Backend of the episode, whose true scene the search uses.
             search: Searches for plans.
+            target: What the episode looks for; None for all objects.
         """
+        self._targets = frozenset[str]() if target is None else target.names
         self._backend = backend
         self._search = search
         self._plan: list[Move] = []
@@ -111,6 +117,7 @@ class OracleExplorer:
                 known=[o.name for o in belief.objects],
                 rng=rng,
                 invalid_moves=invalid_moves,
+                targets=self._targets,
             )
             self._plan = list(result.plan)
         return Decision(self._plan.pop(0) if self._plan else None)
@@ -135,33 +142,44 @@ PRETRAINED_EXPLORERS = {
 """Checkpoints that ship with the package, by the name of the agent."""
 ORACLE = "full-knowledge"
 """Name of the agent that is an `OracleExplorer`."""
+AREA_REDUCTION = "area-reduction"
+"""Name of the agent that is an `AreaReductionExplorer`."""
 
 
 def make_policy_factory(
-    name: str, config: ClutterConfig, classes: Collection[str] = ()
+    name: str,
+    config: ClutterConfig,
+    classes: Collection[str] = (),
+    target: SearchTarget | None = None,
 ) -> PolicyFactory:
     """Return a factory of the policies of an agent.
 
     Args:
-        name: One of `BASELINE_POLICIES`, one of `PRETRAINED_EXPLORERS`, `ORACLE`, or the file of a
-            checkpoint.
+        name: One of `BASELINE_POLICIES`, one of `PRETRAINED_EXPLORERS`, `AREA_REDUCTION`, `ORACLE`,
+            or the file of a checkpoint.
         config: Configuration of the simulated world.
         classes: Names of the object classes that will occur, as far as they are known.
+        target: What the episodes look for; None for all objects.
 
     Raises:
-        InputError: The agent is unknown, the file is not a checkpoint of an exploration policy, or
-            the policy was not trained with one of the classes.
+        InputError: The agent is unknown, the file is not a checkpoint of an exploration policy,
+            the policy was not trained with one of the classes, or it needs a target.
     """
     if name in BASELINE_POLICIES:
         return lambda _: BASELINE_POLICIES[name]
     if name == ORACLE:
         search = OracleSearch(config)
-        return lambda backend: OracleExplorer(backend, search)
+        return lambda backend: OracleExplorer(backend, search, target)
+    if name == AREA_REDUCTION:
+        if target is None:
+            raise InputError(f"--agent {name}: looks for one object; expected a target")
+        policy = AreaReductionExplorer(target.object_class, config.exploration)
+        return lambda _: policy
     if name not in PRETRAINED_EXPLORERS and not name.endswith(".safetensors"):
-        allowed = ", ".join([*BASELINE_POLICIES, *PRETRAINED_EXPLORERS, ORACLE])
+        allowed = ", ".join([*BASELINE_POLICIES, *PRETRAINED_EXPLORERS, AREA_REDUCTION, ORACLE])
         raise InputError(f"--agent {name}; expected {allowed}, or a .safetensors file")
     path = checkpoint_path(name, PRETRAINED_EXPLORERS)
     # Imported late: needs PyTorch, which is not required for the other agents.
     from drake_clutter.agents.learned_explorer import LearnedExplorerFactory
 
-    return LearnedExplorerFactory(path, config.exploration, classes)
+    return LearnedExplorerFactory(path, config.exploration, classes, target)

@@ -141,13 +141,25 @@ class GraphNetwork(RenamedParameters):
         self.global_encoder = nn.Linear(num_global_features, width)
         self.layers = MessagePassing(width, edge_width, layers)
 
-    def forward(self, batch: GraphBatch) -> tuple[Tensor, Tensor]:
-        """Return embeddings of the nodes (M, H) and of the graphs (B, H)."""
-        node = leaky_relu(
-            self.node_kind_embedding(batch.node_kind) + self.node_encoder(batch.node_features)
-        )
+    def forward(
+        self,
+        batch: GraphBatch,
+        node_offset: Tensor | None = None,
+        global_offset: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Return embeddings of the nodes (M, H) and of the graphs (B, H).
+
+        Args:
+            batch: The graphs.
+            node_offset: What is added to the encoded nodes; None for nothing. Shape (M, H).
+            global_offset: What is added to the encoded global features; None for nothing. Shape
+                (B, H).
+        """
+        node = self.node_kind_embedding(batch.node_kind) + self.node_encoder(batch.node_features)
+        node = leaky_relu(node if node_offset is None else node + node_offset)
         edge = leaky_relu(self.edge_kind_embedding.weight)
-        glob = leaky_relu(self.global_encoder(batch.global_features))
+        glob = self.global_encoder(batch.global_features)
+        glob = leaky_relu(glob if global_offset is None else glob + global_offset)
         embeddings: tuple[Tensor, Tensor] = self.layers(node, glob, edge, batch.connectivity)
         return embeddings
 

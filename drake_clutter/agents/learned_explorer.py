@@ -28,7 +28,8 @@ from drake_clutter.tasks.exploration_graph import (
     RENAMED_FEATURES,
     build_exploration_graph,
 )
-from drake_clutter.validation import NetworkWidth, NonEmptyText, StrictModel, validate
+from drake_clutter.tasks.search_target import SearchTarget
+from drake_clutter.validation import Flag, NetworkWidth, NonEmptyText, StrictModel, validate
 
 TEACHER = "teacher"
 """Kind of the checkpoints of privileged policies."""
@@ -36,19 +37,23 @@ STUDENT = "student"
 """Kind of the checkpoints of policies that observe K_t."""
 
 
-def explorer_metadata(node_kind_ids: dict[str, int], width: int) -> dict[str, Any]:
+def explorer_metadata(
+    node_kind_ids: dict[str, int], width: int, *, finds_target: bool = False
+) -> dict[str, Any]:
     """Return the metadata that a checkpoint needs to recreate an `ExplorerNetwork`.
 
     Args:
         node_kind_ids: Numbers of the kinds of nodes by name, from 1 on.
         width: Width of the embeddings.
+        finds_target: Whether the policy is conditioned on a target.
     """
-    return {
+    metadata = {
         "node_kinds": list(node_kind_ids),
         "features": list(NODE_FEATURES),
         "edge_kinds": list(EDGE_KINDS),
         "width": width,
     }
+    return metadata | {"finds_target": True} if finds_target else metadata
 
 
 class _NetworkEntry(StrictModel):
@@ -58,6 +63,7 @@ class _NetworkEntry(StrictModel):
     features: tuple[NonEmptyText, ...] = ()
     edge_kinds: tuple[NonEmptyText, ...] = ()
     width: NetworkWidth
+    finds_target: Flag = False
 
 
 def load_explorer(
@@ -88,11 +94,13 @@ def load_explorer(
     for key in ("features", "edge_kinds"):
         names = [RENAMED_FEATURES.get(name, name) for name in network_metadata.get(key, ())]
         network_metadata = {**network_metadata, key: names}
-    if network_metadata != explorer_metadata(node_kind_ids, network_metadata["width"]):
+    finds_target = network_metadata.get("finds_target", False)
+    width = network_metadata["width"]
+    if network_metadata != explorer_metadata(node_kind_ids, width, finds_target=finds_target):
         raise InputError(
             f"{path}: was trained on other features; expected a checkpoint of this version"
         )
-    network = ExplorerNetwork(len(node_kind_ids), network_metadata["width"])
+    network = ExplorerNetwork(len(node_kind_ids), width, finds_target=finds_target)
     load_weights(network, checkpoint.weights, path)
     return network.eval(), node_kind_ids
 
@@ -117,6 +125,7 @@ class LearnedExplorer:
         path: Path,
         config: ExplorationConfig,
         backend: Backend | None = None,
+        target: SearchTarget | None = None,
     ) -> None:
         """Create the policy of an episode.
 
@@ -127,12 +136,14 @@ class LearnedExplorer:
             config: Clearances of placements.
             backend: Backend of the episode, whose true scene a privileged policy observes; None for
                 a policy that observes K_t.
+            target: What a policy that is conditioned on a target looks for.
         """
         self._network = network
         self._node_kind_ids = node_kind_ids
         self._path = path
         self._config = config
         self._backend = backend
+        self._target = target
 
     def __call__(
         self,
@@ -153,6 +164,7 @@ class LearnedExplorer:
             belief.history,
             self._node_kind_ids,
             belief.invalid_moves,
+            target=self._target,
         )
         action_mask = graph["action_mask"]
         names = tuple(o.name for o in objects)
@@ -185,7 +197,11 @@ class LearnedExplorerFactory:
     """
 
     def __init__(
-        self, path: Path, config: ExplorationConfig, classes: Collection[str] = ()
+        self,
+        path: Path,
+        config: ExplorationConfig,
+        classes: Collection[str] = (),
+        target: SearchTarget | None = None,
     ) -> None:
         """Load a checkpoint of `train_explorer_ppo.py` or `train_explorer_dagger.py`.
 
@@ -193,16 +209,21 @@ class LearnedExplorerFactory:
             path: File of the checkpoint.
             config: Clearances of placements.
             classes: Names of the object classes that will occur, as far as they are known.
+            target: What the episodes look for; None for all objects.
 
         Raises:
-            InputError: The file cannot be read, is not a checkpoint of an exploration policy, or
-                the policy was not trained with one of the classes.
+            InputError: The file cannot be read, is not a checkpoint of an exploration policy, the
+                policy was not trained with one of the classes, or it needs a target.
         """
         self._path = path
         self._config = config
         checkpoint = load_checkpoint(path)
         self._network, self._node_kind_ids = load_explorer(checkpoint, path)
-        _check_classes(classes, self._node_kind_ids, path)
+        wanted = () if target is None else (target.object_class.name,)
+        _check_classes([*classes, *wanted], self._node_kind_ids, path)
+        if self._network.finds_target and target is None:
+            raise InputError(f"--agent {path}: looks for one object; expected a target")
+        self._target = target if self._network.finds_target else None
         self.privileged = checkpoint.metadata["kind"] == TEACHER
 
     def __call__(self, backend: Backend | None = None) -> LearnedExplorer:
@@ -213,4 +234,5 @@ class LearnedExplorerFactory:
             self._path,
             self._config,
             backend if self.privileged else None,
+            self._target,
         )

@@ -115,7 +115,11 @@ class PPOLearner:
         self._environment = environment
         self._seed = seed
         torch.manual_seed(seed)
-        self.network = ExplorerNetwork(len(environment.node_kind_ids), config.width).to(device)
+        self.network = ExplorerNetwork(
+            len(environment.node_kind_ids),
+            config.width,
+            finds_target=environment.target_text is not None,
+        ).to(device)
         self._optimizer = torch.optim.Adam(self.network.parameters(), config.learning_rate)
         self.step = 0
         self._iteration = 0

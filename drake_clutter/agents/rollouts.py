@@ -127,17 +127,13 @@ def episode_metrics(rollouts: Sequence[Rollout]) -> dict[str, float]:
     """Return metrics of the learning progress.
 
     Returns:
-        success: Fraction of episodes in which all hidden objects were found.
+        success: Fraction of episodes in which all hidden objects, or the target, were found.
         found_share: Fraction of all hidden objects that were found.
         collapsed: Fraction of episodes in which the scene collapsed or an object left the support.
         moves_of_successes: Mean number of moves of the successful episodes; 0 without any.
         score: Mean return.
     """
-    lengths = [
-        len(rollout.actions)
-        for rollout in rollouts
-        if rollout.termination is TerminationReason.ALL_FOUND
-    ]
+    lengths = [len(rollout.actions) for rollout in rollouts if rollout.termination.is_success]
     num_collapsed = sum(rollout.termination.is_failed_move for rollout in rollouts)
     num_hidden = sum(rollout.num_hidden for rollout in rollouts)
     num_found = sum(rollout.num_found for rollout in rollouts)

@@ -38,6 +38,8 @@ DEFAULT_WRIST_CAMERA = Camera(
     pose=PoseSpec(translation=(0.0, -0.10, 0.04), rpy_deg=(-15.0, 0.0, 0.0))
 )
 """RealSense D435 beside the flange that is tilted towards the tool; an assumed mounting."""
+DEFAULT_HANDOVER = PoseSpec(translation=(-0.15, 0.55, -0.011))
+"""Place on the table beside the tray of the default cell."""
 _RESERVED_NAMES = ("tray", "camera", "pedestal", "robot", "gripper")
 """Names that fixtures may not have: those of the other parts of a cell."""
 
@@ -53,6 +55,9 @@ class WorkCell(StrictModel):
         fixtures: Fixed obstacles.
         wrist_camera: Camera on the flange, whose images are recorded; its `pose` is X_FC. It is a
             sensor without a body.
+        handover: Pose X_TH of the place where a retrieved object is put, beside the support: H is
+            level, and the object's bottom comes to rest at its origin. The default is on the table
+            beside a tray of 0.7 m. None if there is none.
     """
 
     robot: RobotSpec
@@ -61,6 +66,7 @@ class WorkCell(StrictModel):
     cameras: Annotated[dict[NonEmptyText, Camera], Field(min_length=1)]
     fixtures: tuple[Fixture, ...] = ()
     wrist_camera: Camera = DEFAULT_WRIST_CAMERA
+    handover: PoseSpec | None = DEFAULT_HANDOVER
 
     @field_validator("gripper", mode="before")
     @classmethod

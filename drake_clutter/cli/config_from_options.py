@@ -12,7 +12,9 @@ if TYPE_CHECKING:
     from drake_clutter.config import ClutterConfig
     from drake_clutter.scenes.scene_file import SceneFile
 
-CELL_FIELDS = frozenset({"robot", "gripper", "support", "cameras", "fixtures", "wrist_camera"})
+CELL_FIELDS = frozenset(
+    {"robot", "gripper", "support", "cameras", "fixtures", "wrist_camera", "handover"}
+)
 """Fields of the work cell, which settings may name without the prefix `cell.`."""
 _SUPPORT_FIELDS = (
     "cell.support",

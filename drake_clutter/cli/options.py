@@ -89,8 +89,24 @@ ExplorerOption = Annotated[
     typer.Option(
         "--agent",
         help="Exploration policy: random, largest-first or largest-clear (rules); student, "
-        "student-dagger, student-14, student-rg or teacher (trained); full-knowledge (optimal "
-        "plans from the true state); or a checkpoint file.",
+        "student-dagger, student-14, student-rg or teacher (trained); area-reduction (with a "
+        "target); full-knowledge (optimal plans from the true state); or a checkpoint file.",
+    ),
+]
+TargetOption = Annotated[
+    str,
+    typer.Option(
+        "--target",
+        metavar="CLASS|NAME|random-hidden",
+        help="Search for one object: any of a class, the one of a name, or one that is drawn among "
+        "the hidden ones. The policy is told its class. Default: search for all objects.",
+    ),
+]
+RetrieveOption = Annotated[
+    bool,
+    typer.Option(
+        "--retrieve",
+        help="When the target is seen, put it on the hand-over place of the cell.",
     ),
 ]
 WorkersOption = Annotated[

@@ -8,6 +8,7 @@ import numpy as np
 
 from drake_clutter.agents.backend_factory import make_backend_factory
 from drake_clutter.agents.explorers import make_policy_factory
+from drake_clutter.agents.retrieval import RetrievingExplorer
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, input_error, write_json
 from drake_clutter.perception.label_detector import LabelDetector
@@ -36,6 +37,7 @@ from drake_clutter.station.arm_executor import ArmExecutor
 from drake_clutter.tasks.belief import Belief, Decision, Policy
 from drake_clutter.tasks.episode import Backend, run_episode
 from drake_clutter.tasks.exploration_task import ExplorationTask, TerminationReason, Transition
+from drake_clutter.tasks.search_target import require_target
 from drake_clutter.validation import NonEmptyText, StrictModel, to_plain, validate
 from drake_clutter.yaml_io import read_yaml
 
@@ -75,6 +77,9 @@ def explore_scene(
     seed: int,
     config: ClutterConfig,
     on_transition: TransitionCallback,
+    target_text: str = "",
+    *,
+    retrieve: bool = False,
 ) -> ExplorationTask:
     """Run an exploration episode.
 
@@ -86,10 +91,30 @@ def explore_scene(
         seed: Seed of the policy and the simulation.
         config: Configuration.
         on_transition: Called after each move.
+        target_text: What is looked for, see `find_target`; "" for all objects.
+        retrieve: Whether the target is put on the hand-over place of the cell when it is seen.
+
+    Raises:
+        InputError: The scene has no such target, or the policy cannot look for it, or the cell has
+            no hand-over place.
     """
-    backend = make_backend_factory(fidelity, config, simulate_collapse=True)(scene, item_rng(seed))
-    policy = make_policy_factory(agent_name, config)(backend)
-    return run_episode(backend, policy, max_moves=max_moves, on_transition=on_transition)
+    rng = item_rng(seed)
+    backend = make_backend_factory(fidelity, config, simulate_collapse=True)(scene, rng)
+    target = None
+    if target_text:
+        in_view = [d.name for d in backend.perception.observation.detections]
+        target = require_target(target_text, scene, in_view, rng)
+    policy = make_policy_factory(agent_name, config, target=target)(backend)
+    if target is not None and retrieve:
+        policy = RetrievingExplorer(policy, target, config.cell, config.exploration)
+    return run_episode(
+        backend,
+        policy,
+        max_moves=max_moves,
+        on_transition=on_transition,
+        target=target,
+        retrieve=retrieve,
+    )
 
 
 def _check_move(moves: Sequence[Move], index: int, visible: Sequence[str], scene: Scene) -> None:
@@ -249,6 +274,24 @@ def read_moves(path: Path) -> list[Move]:
     return [Move(entry.pick, entry.place) for entry in entries]
 
 
+def target_to_dict(task: ExplorationTask) -> dict[str, Any]:
+    """Return what an episode looked for, and which of its objects were found."""
+    assert task.target is not None
+    names = sorted(task.target.names)
+    return {
+        "asked": task.target.text,
+        "object_class": task.target.object_class.name,
+        "objects": names,
+        "found": [name for name in names if name in task.detected],
+        "retrieved": [
+            name
+            for name in names
+            if task.termination is TerminationReason.RETRIEVED
+            and name == task.transitions[-1].move.pick
+        ],
+    }
+
+
 def episode_to_dict(task: ExplorationTask, agent: str, fidelity: str, seed: int) -> dict[str, Any]:
     """Return the document of `episode.json`."""
     end = task.termination or TerminationReason.GAVE_UP
@@ -272,10 +315,11 @@ def episode_to_dict(task: ExplorationTask, agent: str, fidelity: str, seed: int)
         "agent": agent,
         "seed": seed,
         "fidelity": fidelity,
-        "success": end is TerminationReason.ALL_FOUND,
+        "success": end.is_success,
         "termination": end.value,
         "trajectory": TRAJECTORY_FILE if fidelity == "arm" else None,
         "num_objects": len(task.scene.objects),
+        **({} if task.target is None else {"target": target_to_dict(task)}),
         "initially_hidden": list(task.initially_hidden),
         "found": list(task.found),
         "total_reward": sum(step.reward for step in task.transitions),

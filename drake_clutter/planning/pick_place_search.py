@@ -168,7 +168,9 @@ class PickPlaceSearch:
         # Heights of the object's bottom: above its pick and place pose, or above a higher obstacle.
         self._place_bottom = placed.bounds_T[0][2]
         bottom = max(picked.bounds_T[0][2], self._place_bottom)
-        all_tops = (*obstacle_tops, *(o.top_height for o in self._others))
+        all_tops = [*obstacle_tops, *(o.top_height for o in self._others)]
+        if not all(cell.support.contains(*X.translation[:2]) for X in (picked.X_TO, X_TO_place)):
+            all_tops.append(cell.support.wall_height)
         tops = sorted({round(top, 3) for top in all_tops if top > bottom})
         lift_height = goal.lift_height
         self._transfer_heights = [bottom + lift_height]

@@ -92,12 +92,15 @@ def describe_generation(summary: Mapping[str, Any]) -> dict[str, str]:
 def describe_episode(episode: Mapping[str, Any]) -> dict[str, str]:
     """Return an `episode.json` as texts by label."""
     hidden = episode["initially_hidden"]
-    return {
+    rows = {
         "result": f"{episode['termination']} after {_number(len(episode['moves']), 'move')}",
         "objects": f"{episode['num_objects']}, of which {len(hidden)} hidden at the start",
         "found": f"{len(episode['found'])} of {len(hidden)}: {_names(episode['found'])}",
         "total reward": f"{episode['total_reward']:g}",
     }
+    if target := episode.get("target"):
+        rows["target"] = f"{target['object_class']}, found: {_names(target['found'])}"
+    return rows
 
 
 def describe_solution(solution: Mapping[str, Any]) -> dict[str, str]:

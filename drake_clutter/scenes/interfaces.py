@@ -196,6 +196,11 @@ class PickPlaceCommand:
     X_TO_pick: Pose
     X_TO_place: Pose
 
+    def is_beside(self, support: Support) -> bool:
+        """Return whether the move names a pose beside the support, such as a hand-over place."""
+        is_pose = self.move.place_values is not None
+        return is_pose and not support.contains(*self.X_TO_place.translation[:2])
+
 
 class MoveResult(Enum):
     """How a move ended.

@@ -1,7 +1,7 @@
 """Settling objects in Drake until they fall, come to rest, or the time is up."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,7 +37,12 @@ class SettleResult:
 
 
 def find_instability(
-    before: SceneObject, after: Pose, support: Support, config: SettleConfig
+    before: SceneObject,
+    after: Pose,
+    support: Support,
+    config: SettleConfig,
+    *,
+    is_beside: bool = False,
 ) -> Instability | None:
     """Return how an object fell, or None if it stayed within the limits.
 
@@ -46,10 +51,11 @@ def find_instability(
         after: Its present pose.
         support: Support of the object.
         config: Limits of displacement and tilt.
+        is_beside: Whether the object was placed beside the support on purpose.
     """
     displacement = _distance(after, before.X_TO)
     tilt = tilt_between(before.object_class, before.X_TO, after)
-    if not support.carries(after.translation):
+    if not is_beside and not support.carries(after.translation):
         reason = InstabilityReason.LEFT_TRAY
     elif tilt >= math.radians(config.max_tilt_deg):
         reason = InstabilityReason.TOPPLED
@@ -67,6 +73,7 @@ def settle(
     *,
     record: bool = False,
     simulate_collapse: bool = False,
+    beside: Collection[str] = (),
 ) -> SettleResult:
     """Simulate objects on a support from rest.
 
@@ -81,6 +88,7 @@ def settle(
         record: Whether to record the motion.
         simulate_collapse: Whether to go on after a fall until all objects are at rest or the time
             is up.
+        beside: Names of objects that were placed beside the support on purpose.
     """
     builder = DiagramBuilder()
     scene_plant = add_scene_plant(
@@ -123,7 +131,12 @@ def settle(
             instabilities = [
                 item
                 for o in objects
-                if (item := find_instability(o, poses[o.name], support, config)) is not None
+                if (
+                    item := find_instability(
+                        o, poses[o.name], support, config, is_beside=o.name in beside
+                    )
+                )
+                is not None
             ]
             instability = max(instabilities, key=lambda item: item.displacement, default=None)
             if instability is not None and not simulate_collapse:

@@ -52,6 +52,7 @@ class SettleExecutor:
         placed = replace(scene[pick], X_TO=command.X_TO_place)
         (released,) = perturb_poses([placed], settle_config.jitter, rng)
         moved = scene.with_poses({pick: released.X_TO})
+        beside = {pick} if command.is_beside(scene.support) else set[str]()
 
         groups = group_touching_objects(scene.objects, TOUCHING_MARGIN)
         affected = next(names for group in groups if pick in (names := {o.name for o in group}))
@@ -59,7 +60,7 @@ class SettleExecutor:
         for group in _groups_to_settle(moved, released):
             if affected.isdisjoint(o.name for o in group):
                 continue
-            settled.append(settle(group, scene.support, settle_config, record=True))
+            settled.append(settle(group, scene.support, settle_config, record=True, beside=beside))
             if settled[-1].instability is not None:
                 if self._simulate_collapse:
                     coarse_config = replace(settle_config, time_step=_COLLAPSE_TIME_STEP)
@@ -69,6 +70,7 @@ class SettleExecutor:
                         coarse_config,
                         record=True,
                         simulate_collapse=True,
+                        beside=beside,
                     )
                     poses, motion = whole.poses, whole.motion
                 else:

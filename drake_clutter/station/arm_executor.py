@@ -1,6 +1,6 @@
 """Move executor with a simulated arm: planning, simulation of the motion, outcome."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -88,7 +88,13 @@ class ArmExecutor:
         X_TO_place = plan.X_TO_place.translated((0.0, 0.0, -result.lowered_distance))
         after = scene.with_poses(result.poses)
         outcome = evaluate_outcome(
-            scene, after, command.move.pick, X_TO_place, result.lost_object, self._config.settle
+            scene,
+            after,
+            command.move.pick,
+            X_TO_place,
+            result.lost_object,
+            self._config.settle,
+            is_beside=command.is_beside(scene.support),
         )
         return replace(outcome, samples=result.samples, detail=str(result))
 
@@ -100,6 +106,8 @@ def evaluate_outcome(
     X_TO_place: Pose,
     lost_object: bool,
     config: SettleConfig,
+    *,
+    is_beside: bool = False,
 ) -> Outcome:
     """Settle the disturbed objects after an arm motion and return the outcome.
 
@@ -110,20 +118,22 @@ def evaluate_outcome(
         X_TO_place: Pose at which the object was to be released.
         lost_object: Whether the object detached from the gripper before it was released.
         config: Limits of displacement and tilt.
+        is_beside: Whether the object was to be placed beside the support.
     """
+    beside = {pick} if is_beside else set[str]()
     expected = before.with_poses({pick: X_TO_place})
     # An object that detaches at touchdown and stays at its place pose came off, but is not dropped.
-    dropped = lost_object and worst_instability([expected[pick]], after, config) is not None
+    dropped = lost_object and worst_instability([expected[pick]], after, config, beside) is not None
     support = before.support
     # Only the move at which an object leaves the support is blamed for it.
     on_support = {o.name for o in before.objects if support.carries(o.X_TO.translation)}
-    is_picked_lost = dropped and support.carries(after[pick].X_TO.translation)
+    is_picked_lost = dropped and (is_beside or support.carries(after[pick].X_TO.translation))
     checked = [
         o
         for o in expected.objects
         if (not is_picked_lost if o.name == pick else o.name in on_support)
     ]
-    instability = worst_instability(checked, after, config)
+    instability = worst_instability(checked, after, config, beside)
     if instability is None and not dropped:
         disturbed = {
             o.name
@@ -132,8 +142,8 @@ def evaluate_outcome(
         } | {pick}
         for group in group_touching_objects(after.objects, TOUCHING_MARGIN):
             if not disturbed.isdisjoint(o.name for o in group):
-                after = after.with_poses(settle(group, support, config).poses)
-        instability = worst_instability(checked, after, config)
+                after = after.with_poses(settle(group, support, config, beside=beside).poses)
+        instability = worst_instability(checked, after, config, beside)
     result = MoveResult.PLACED
     if lost_object:
         result = MoveResult.DROPPED if dropped else MoveResult.CAME_OFF
@@ -143,7 +153,10 @@ def evaluate_outcome(
 
 
 def worst_instability(
-    expected: Sequence[SceneObject], after: Scene, config: SettleConfig
+    expected: Sequence[SceneObject],
+    after: Scene,
+    config: SettleConfig,
+    beside: Collection[str] = (),
 ) -> Instability | None:
     """Return an object that left the support, or else the largest displacement, or None.
 
@@ -151,11 +164,16 @@ def worst_instability(
         expected: Objects at their expected poses.
         after: Scene with the actual poses.
         config: Limits of displacement and tilt.
+        beside: Names of objects that were to be placed beside the support.
     """
     instabilities = [
         instability
         for o in expected
-        if (instability := find_instability(o, after[o.name].X_TO, after.support, config))
+        if (
+            instability := find_instability(
+                o, after[o.name].X_TO, after.support, config, is_beside=o.name in beside
+            )
+        )
     ]
     return max(
         instabilities,

@@ -36,6 +36,7 @@ from drake_clutter.tasks.exploration_graph import (
     build_exploration_graph,
 )
 from drake_clutter.tasks.exploration_task import ExplorationTask, MoveAttempt, TerminationReason
+from drake_clutter.tasks.search_target import SearchTarget, find_target, missing_target_error
 
 DEFAULT_SCENES = "training/scenes/train_sg_star.json"
 """Scene dataset of the environment by default."""
@@ -44,7 +45,7 @@ MAX_RESET_ATTEMPTS = 100
 
 
 class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
-    """Environment `ClutterExploration-v0`: find every hidden object.
+    """Environment `ClutterExploration-v0`: find every hidden object, or a target.
 
     A reset samples a scene of a dataset, and lays it out with its stacks at new places. With
     `options={"scene": k}` it uses the settled scene k of the dataset instead.
@@ -62,6 +63,11 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
 
     Termination: all objects have been detected, the scene has collapsed, or an object has left the
     support. Truncation: after `max_moves` moves, or if no move is allowed.
+
+    With a target, an episode ends when an object of the target has been detected, which alone earns
+    the `detection_reward`, and observations have two more arrays: `target_kind` and `is_target`.
+    The policy is told the class. A privileged one sees which nodes are the target. A reset samples
+    scenes in which the target is hidden.
 
     The `info` of a step has the `transition` (a `Transition`) if the move was allowed, and at the
     end of an episode the `termination` (a `TerminationReason`). The outcome of the transition names
@@ -81,6 +87,7 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
         config: ClutterConfig | None = None,
         flat_actions: bool = False,
         render_mode: str | None = None,
+        target: str | None = None,
     ) -> None:
         """Create an environment.
 
@@ -94,6 +101,9 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
                 dataset's work cell.
             flat_actions: Whether an action is the number x * N + y instead of the pair (x, y).
             render_mode: "rgb_array" for pictures, or None.
+            target: What an episode looks for: any object of a class, the object of a name, or
+                "random-hidden", an object that is drawn among the hidden ones. None looks for all
+                objects.
 
         Raises:
             InputError: There is no such file, fidelity or render mode, or `max_objects` is not
@@ -130,6 +140,12 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
             "global_features": box(0, FEATURE_BOUND, (len(GLOBAL_FEATURES),), np.float32),
             "action_mask": box(0, 1, (n, n), np.int8),
         }
+        self.target_text = target
+        if target is not None:
+            spaces |= {
+                "target_kind": box(1, num_kinds, (1,), index_type(num_kinds)),
+                "is_target": box(0, 1, (n,), np.int8),
+            }
         self.observation_space = gymnasium.spaces.Dict(spaces)  # type: ignore[assignment]
         self._flat_actions = flat_actions
         self.action_space: gymnasium.Space[Any] = (
@@ -171,11 +187,12 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
             )
             is_stable = self._judge.find_instability(scene) is None
             if is_stable and len(scene.objects) < self._max_nodes:
-                observation = self.reset_to_scene(scene)
-                if self.task.termination is None:
-                    return observation
+                is_started = self._start(scene)
+                if is_started and self.task.termination is None:
+                    return self._observe_and_keep_mask()
+        wanted = "something" if self.target_text is None else f"the target {self.target_text}"
         raise InputError(
-            f"{self.scenes.name}: of {MAX_RESET_ATTEMPTS} scenes none stands and hides something, "
+            f"{self.scenes.name}: of {MAX_RESET_ATTEMPTS} scenes none stands and hides {wanted}, "
             f"with at most {self._max_nodes - 1} objects"
         )
 
@@ -183,21 +200,34 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
         """Start an episode on a given scene at rest, and return the observation.
 
         Raises:
-            InputError: The scene has more than `max_objects` objects.
+            InputError: The scene has more than `max_objects` objects, or has no target.
         """
         if len(scene.objects) >= self._max_nodes:
             raise InputError(
                 f"max_objects: {self._max_nodes - 1}; this scene has {len(scene.objects)}"
             )
+        if not self._start(scene):
+            raise missing_target_error(self.target_text or "", scene)
+        return self._observe_and_keep_mask()
+
+    def _start(self, scene: Scene) -> bool:
+        """Start an episode on a scene at rest; return whether the scene has a target."""
         self.backend = self._make_backend(scene, self.np_random)
         self._num_masked_moves = 0
+        self.target: SearchTarget | None = None
+        if self.target_text is not None:
+            in_view = [d.name for d in self.backend.perception.observation.detections]
+            self.target = find_target(self.target_text, scene, in_view, self.np_random)
+            if self.target is None:
+                return False
         self.task = ExplorationTask(
             scene,
             self.backend.perception,
             self._config.exploration,
             self._max_moves,
+            self.target,
         )
-        return self._observe_and_keep_mask()
+        return True
 
     def _observe_and_keep_mask(self) -> ExplorationObservation:
         """Return the observation, and keep its action mask for the next step."""
@@ -235,6 +265,7 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
             self.node_kind_ids,
             belief.invalid_moves,
             max_nodes=self._max_nodes,
+            target=self.target,
         )
 
     def action_masks(self) -> NDArray[np.bool_]:
@@ -301,7 +332,7 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
         if termination is None and not observation["action_mask"].any():
             termination = TerminationReason.GAVE_UP
         terminated = termination is not None and (
-            termination is TerminationReason.ALL_FOUND or termination.is_failed_move
+            termination.is_success or termination.is_failed_move
         )
         truncated = termination is not None and not terminated
         info: dict[str, Any] = {"transition": transition}

@@ -38,6 +38,7 @@ from drake_clutter.tasks.exploration_task import (
     TerminationReason,
     Transition,
 )
+from drake_clutter.tasks.search_target import SearchTarget
 
 
 class Backend(Protocol):
@@ -76,6 +77,8 @@ def run_episode(
     max_moves: int,
     on_transition: Callable[[Transition], None] = lambda _: None,
     stop_when_all_found: bool = True,
+    target: SearchTarget | None = None,
+    retrieve: bool = False,
 ) -> ExplorationTask:
     """Run an episode, and return its record.
 
@@ -85,8 +88,12 @@ def run_episode(
         max_moves: Maximum number of attempted moves.
         on_transition: Called after each attempted move.
         stop_when_all_found: Whether the episode ends when every object has been detected.
+        target: What the episode looks for; None for all objects.
+        retrieve: Whether the episode ends when the target is retrieved, instead of found.
     """
-    task = ExplorationTask(backend.scene, backend.perception, backend.config, max_moves)
+    task = ExplorationTask(
+        backend.scene, backend.perception, backend.config, max_moves, target, retrieve=retrieve
+    )
     nonterminal = (None,) if stop_when_all_found else (None, TerminationReason.ALL_FOUND)
     attempts = backend.rollout(policy)
     while task.termination in nonterminal and (attempt := next(attempts, None)) is not None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from drake_clutter.scenes.interfaces import Move, Observation
 from drake_clutter.scenes.scene import TRAY, SceneObject
 from drake_clutter.tasks.environment_interface import index_type
+from drake_clutter.tasks.search_target import SearchTarget
 
 ExplorationObservation = dict[str, NDArray[Any]]
 """Arrays of `build_exploration_graph` by name."""
@@ -120,6 +121,7 @@ def build_exploration_graph(
     node_kind_ids: Mapping[str, int],
     invalid_moves: Collection[Move] = (),
     max_nodes: int = 0,
+    target: SearchTarget | None = None,
 ) -> ExplorationObservation:
     """Return the graph of some objects as arrays; node 0 is the tray, node k the k-th object.
 
@@ -130,6 +132,7 @@ def build_exploration_graph(
         node_kind_ids: Numbers of the kinds of nodes, the tray and the classes, from 1 on.
         invalid_moves: Moves that are masked.
         max_nodes: Number N of nodes of the arrays; 0 for n + 1.
+        target: What the episode looks for; None for all objects.
 
     Returns:
         node_kind: Numbers of the kinds of the nodes; 0 is padding. Shape (N,).
@@ -139,6 +142,8 @@ def build_exploration_graph(
         global_features: See `GLOBAL_FEATURES`. Shape (1,).
         action_mask: Whether the row's node may be placed on the column's node: both are in view, or
             the latter is the tray, and the move is not invalid. Shape (N, N).
+        target_kind: With a target, the number of its class. Shape (1,).
+        is_target: With a target, whether the node is one of its objects. Shape (N,).
     """
     count = len(objects)
     num_nodes = max_nodes or count + 1
@@ -185,7 +190,7 @@ def build_exploration_graph(
         for move in invalid_moves:
             action_mask[node[move.pick], node[move.place]] = 0
     num_moves = min(FEATURE_BOUND, len(history) / _NUM_MOVES_SCALE)
-    return {
+    graph = {
         "node_kind": node_kind,
         "node_features": node_features,
         "edge_links": edge_links,
@@ -193,6 +198,12 @@ def build_exploration_graph(
         "global_features": np.array([num_moves], np.float32),
         "action_mask": action_mask,
     }
+    if target is not None:
+        is_target = np.zeros(num_nodes, np.int8)
+        is_target[1 : count + 1] = [o.name in target.names for o in objects]
+        kind = node_kind_ids[target.object_class.name]
+        graph |= {"target_kind": np.array([kind], node_kind.dtype), "is_target": is_target}
+    return graph
 
 
 def _object_features(

@@ -1,4 +1,4 @@
-"""Scene exploration: find every hidden object by moving objects that are in view.
+"""Scene exploration: find hidden objects, all or a target, by moving objects that are in view.
 
 `ExplorationTask` evaluates an episode with the ground truth: discovered objects, rewards and the
 reason of its termination.
@@ -12,12 +12,15 @@ from drake_clutter.perception.label_detector import PerceptionResult
 from drake_clutter.scenes.interfaces import Move, MoveResult, Outcome
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.tasks.belief import Decision
+from drake_clutter.tasks.search_target import SearchTarget
 
 
 class TerminationReason(Enum):
     """Why an episode ended.
 
     - `ALL_FOUND`: Every object has been in view.
+    - `TARGET_FOUND`: An object that the search looks for has been in view.
+    - `RETRIEVED`: An object that the search looks for is at the hand-over place.
     - `COLLAPSED`: The latest move made the scene collapse.
     - `LEFT_TRAY`: An object fell off the support at the latest move.
     - `OUT_OF_MOVES`: The maximum number of moves was reached.
@@ -25,10 +28,21 @@ class TerminationReason(Enum):
     """
 
     ALL_FOUND = "all found"
+    TARGET_FOUND = "target found"
+    RETRIEVED = "retrieved"
     COLLAPSED = MoveResult.COLLAPSED.value
     LEFT_TRAY = MoveResult.LEFT_TRAY.value
     OUT_OF_MOVES = "out of moves"
     GAVE_UP = "gave up"
+
+    @property
+    def is_success(self) -> bool:
+        """Whether the episode has reached its goal."""
+        return self in (
+            TerminationReason.ALL_FOUND,
+            TerminationReason.TARGET_FOUND,
+            TerminationReason.RETRIEVED,
+        )
 
     @property
     def is_failed_move(self) -> bool:
@@ -65,8 +79,9 @@ class Transition(MoveAttempt):
     Attributes:
         newly_found: Names of the objects that were detected for the first time, in the order of
             the scene's objects.
-        reward: `detection_reward` per newly found object, plus `collapse_penalty` if the scene
-            collapsed or an object left the support.
+        reward: `detection_reward` per newly found object, or, in a search for a target, when an
+            object of the target is found first; plus `collapse_penalty` if the scene collapsed or
+            an object left the support.
     """
 
     newly_found: tuple[str, ...]
@@ -80,7 +95,10 @@ class ExplorationTask:
     the support, or after a maximum number of moves. Objects that such a move uncovers do not count
     as found. A move that could not be carried out counts as a move.
 
+    An episode with a target ends when one of its objects has been in view, or has been retrieved.
+
     Attributes:
+        target: What the episode looks for; None for all objects.
         initial_scene: The scene at the start.
         scene: The current scene.
         initial_perception: Result of a perfect detector at the start.
@@ -96,6 +114,9 @@ class ExplorationTask:
         initial_perception: PerceptionResult,
         config: ExplorationConfig,
         max_moves: int,
+        target: SearchTarget | None = None,
+        *,
+        retrieve: bool = False,
     ) -> None:
         """Start the record of an episode.
 
@@ -104,7 +125,11 @@ class ExplorationTask:
             initial_perception: Result of a perfect detector for the scene.
             config: Rewards.
             max_moves: Maximum number of moves.
+            target: What the episode looks for; None for all objects.
+            retrieve: Whether the episode ends when the target is retrieved, instead of found.
         """
+        self.target = target
+        self._retrieve = retrieve
         self._config = config
         self._max_moves = max_moves
         self.initial_scene = scene
@@ -125,9 +150,30 @@ class ExplorationTask:
         """
         if self.transitions and self.transitions[-1].outcome.result.ends_episode:
             return TerminationReason(self.transitions[-1].outcome.result.value)
-        if len(self.detected) == len(self.scene.objects):
+        if self._retrieve:
+            if self.transitions and self._is_retrieved(self.transitions[-1]):
+                return TerminationReason.RETRIEVED
+        elif self.target is not None:
+            if self.is_target_found:
+                return TerminationReason.TARGET_FOUND
+        elif len(self.detected) == len(self.scene.objects):
             return TerminationReason.ALL_FOUND
         return TerminationReason.OUT_OF_MOVES if len(self.transitions) >= self._max_moves else None
+
+    @property
+    def is_target_found(self) -> bool:
+        """Whether an object that the episode looks for has been in view."""
+        return self.target is not None and not self.target.names.isdisjoint(self.detected)
+
+    def _is_retrieved(self, transition: Transition) -> bool:
+        """Return whether a move has placed an object of the target beside the support."""
+        pick = transition.move.pick
+        return (
+            self.target is not None
+            and pick in self.target.names
+            and transition.outcome.result.is_at_placement
+            and not self.scene.support.carries(self.scene[pick].X_TO.translation)
+        )
 
     @property
     def found(self) -> tuple[str, ...]:
@@ -153,8 +199,12 @@ class ExplorationTask:
             for name in self.scene.names
             if name in in_view and name not in self.detected and not has_failed
         )
+        was_target_found = self.is_target_found
         self.detected += newly_found
-        reward = self._config.detection_reward * len(newly_found)
+        num_rewarded = len(newly_found)
+        if self.target is not None:
+            num_rewarded = int(self.is_target_found and not was_target_found)
+        reward = self._config.detection_reward * num_rewarded
         reward += self._config.collapse_penalty if has_failed else 0.0
         transition = Transition(
             attempt.decision, attempt.outcome, attempt.next_perception, newly_found, reward

@@ -1,4 +1,4 @@
-"""Oracle search: the shortest sequence of moves that reveals every object of a known scene.
+"""Oracle search: the shortest sequence of moves that reveals the objects of a known scene.
 
 The search has access to the true scene, but only to the moves of an explorer: it picks objects in
 view. Its plans bound what exploration policies can achieve, and it decides whether a scene that
@@ -43,7 +43,8 @@ class SearchResult:
 
     Attributes:
         solvability: Whether a plan exists, as far as it is known within the budget.
-        plan: Moves that reveal every object without a collapse; empty unless solvable.
+        plan: Moves that reveal every object, or the target, without a collapse; empty unless
+            solvable.
         lower_bound: Number of moves below which no plan exists.
         unrevealable: Names of objects that no sequence of moves can reveal, if they prove that the
             scene is unsolvable.
@@ -104,7 +105,8 @@ class OracleSearch:
     The lower bound: a ray from the camera reaches a hidden object only after all objects in front
     of it, and all objects that rest on those, have been moved. Revealing an object thus needs the
     number of moves that frees enough of its rays. The bounds of hidden objects that have no
-    blocking object in common are added.
+    blocking object in common are added. Of a target of several objects, one must be revealed, and
+    the bound is the smallest of theirs.
     """
 
     def __init__(self, config: ClutterConfig, judge: StaticStabilityJudge | None = None) -> None:
@@ -119,6 +121,7 @@ class OracleSearch:
         self._executor = StaticExecutor(config, self._judge)
         self._config = config.exploration
         self._visibility_threshold = config.cell.camera.visibility_threshold
+        self._targets: frozenset[str] = frozenset()
 
     def solve(
         self,
@@ -131,6 +134,7 @@ class OracleSearch:
         rng: np.random.Generator | None = None,
         invalid_moves: Collection[Move] = (),
         on_evaluation: Callable[[], None] = lambda: None,
+        targets: Collection[str] = (),
     ) -> SearchResult:
         """Search for a plan.
 
@@ -145,6 +149,7 @@ class OracleSearch:
                 state is not changed.
             invalid_moves: Moves that failed in this scene, with which no plan may start.
             on_evaluation: Called before each move that is evaluated.
+            targets: Names of the objects of which one is to be revealed; empty for all objects.
 
         Raises:
             InputError: The scene has more than `MAX_OBJECTS` objects.
@@ -159,10 +164,17 @@ class OracleSearch:
         self._remaining_budget = budget
         self._has_inconclusive_verdict = False
         rng_state = (rng or item_rng(seed)).bit_generator.state
+        self._targets = frozenset(targets)
         start = self._make_state(scene, frozenset(known), rng_state)
         immovable = self._judge.immovable_objects(scene)
         fixed = immovable if isinstance(immovable, frozenset) else ()
         unrevealable = self.find_unrevealable(scene, start.known, fixed)
+        if targets and unrevealable:
+            unrevealable = tuple(name for name in unrevealable if name in targets)
+            if len(unrevealable) < len(self._targets):
+                self._targets -= {*unrevealable}
+                unrevealable = ()
+                start = self._make_state(scene, frozenset(known), rng_state)
         lower_bound = start.lower_bound
         if unrevealable:
             return SearchResult(Solvability.UNSOLVABLE, (), lower_bound, unrevealable, 0)
@@ -207,6 +219,9 @@ class OracleSearch:
         observation, _ = self._ray_caster.observe(scene)
         known |= {detection.name for detection in observation.detections}
         hidden = [name for name in scene.names if name not in known]
+        if self._targets:
+            is_found = not self._targets.isdisjoint(known)
+            hidden = [] if is_found else [name for name in hidden if name in self._targets]
         lower_bound = 0
         # Bipartite graph of hidden objects and objects that may have to be moved for them. Nodes
         # have roles, as a hidden object may itself block another one.
@@ -217,8 +232,13 @@ class OracleSearch:
             for name in hidden:
                 num_moves[name], blockers = self._moves_to_reveal(scene, name, move_sets)
                 blocking.add_edges_from((("hidden", name), ("moved", other)) for other in blockers)
-            for component in nx.connected_components(blocking):
-                lower_bound += max(num_moves[name] for role, name in component if role == "hidden")
+            if self._targets:
+                lower_bound = min(num_moves.values())
+            else:
+                for component in nx.connected_components(blocking):
+                    lower_bound += max(
+                        num_moves[name] for role, name in component if role == "hidden"
+                    )
         return _State(
             scene,
             observation,
