@@ -8,7 +8,7 @@ keeps one record per episode; an interrupted run is resumed by the same command,
 of scenes extends it.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -27,7 +27,7 @@ from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.systems.closed_loop import ClosedLoop, default_planner_config
 from drake_clutter.systems.scenario import Scenario, make_perception, make_policy
-from drake_clutter.tasks.belief import Policy
+from drake_clutter.tasks.belief import Decision, Policy
 from drake_clutter.tasks.episode import run_episode
 from drake_clutter.tasks.exploration_task import MoveAttempt, TerminationReason
 from drake_clutter.validation import CountOrZero, Flag, NonEmptyText, NonNegative, to_plain
@@ -94,10 +94,16 @@ class RecordedLoop(ClosedLoop):
 
     plans: dict[int, PickPlacePlan]
 
-    def rollout(self, policy: Policy) -> Iterator[MoveAttempt]:
+    def rollout(self, policy: Policy) -> Generator[MoveAttempt, None, Decision]:
         """Run a policy, see `ClosedLoop.rollout`."""
         self.plans = {}
-        for attempt in super().rollout(policy):
+        attempts = super().rollout(policy)
+        while True:
+            try:
+                attempt = next(attempts)
+            except StopIteration as end:
+                decision: Decision = end.value
+                return decision
             state = self.simulation.executor_state
             if isinstance(state.plan, PickPlacePlan):
                 self.plans[state.number] = state.plan

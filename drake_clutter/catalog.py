@@ -9,7 +9,7 @@ the order of the catalog, a cylinder's axis is z, and a mesh keeps its axes.
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property, lru_cache
@@ -347,6 +347,18 @@ class Catalog:
                 f"object set {name!r} is unknown; known are {', '.join(self.object_sets)}"
             )
         return tuple(self.classes[class_name] for class_name in self.object_sets[name])
+
+    def smallest_set(self, class_names: Collection[str]) -> tuple[ObjectClass, ...]:
+        """Return the classes of the smallest object set that has some classes.
+
+        If no set has all of them, they are all classes of the catalog.
+
+        Args:
+            class_names: Names of the classes.
+        """
+        sets = [names for names in self.object_sets.values() if set(class_names) <= set(names)]
+        names = min(sets, key=len, default=tuple(self.classes))
+        return tuple(self.classes[name] for name in names)
 
 
 def _read_piece(path: Path, remedy: str) -> NDArray[np.float64]:

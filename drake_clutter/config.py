@@ -116,6 +116,34 @@ class PlacementConfig:
 
 
 @config_class
+class BeliefConfig:
+    """When a policy takes every object for known, and stops.
+
+    Attributes:
+        stop_probability: Probability that every object is known from which the policy stops.
+        contact_doubt: Width by which the contact of two known objects may differ from that of their
+            poses [m].
+        uncarried_probability: Probability that something hidden carries a known object that nothing
+            known carries.
+        doubtful_probability: The same for an object that known objects carry only if their poses
+            err by less than `contact_doubt`.
+        unidentified_probability: Probability that depth points of no known object show an unknown
+            one.
+        covered_rate: Expected number of unseen objects below known ones that carry nothing, by area
+            of their possible positions [1/m^2].
+        shadow_rate: The same for unseen objects that are open above, but behind known ones [1/m^2].
+    """
+
+    stop_probability: Annotated[float, InRange(0.0, 1.0)] = 0.95
+    contact_doubt: NonNegative = 0.001
+    uncarried_probability: Annotated[float, InRange(0.0, 1.0)] = 0.99
+    doubtful_probability: Annotated[float, InRange(0.0, 1.0)] = 0.3
+    unidentified_probability: Annotated[float, InRange(0.0, 1.0)] = 0.99
+    covered_rate: NonNegative = 0.1
+    shadow_rate: NonNegative = 1.0
+
+
+@config_class
 class ExplorationConfig:
     """Moves, rewards and placements of the exploration task.
 
@@ -127,6 +155,7 @@ class ExplorationConfig:
             camera sees [m].
         release_height: Height above its support at which an object is released [m].
         placement: What is not known of the objects that are to carry another one.
+        belief: When a policy that stops by itself takes every object for known.
     """
 
     max_moves: Count = 10
@@ -135,6 +164,7 @@ class ExplorationConfig:
     clearance: NonNegative = 0.010
     release_height: NonNegative = 0.001
     placement: PlacementConfig = field(default_factory=PlacementConfig)
+    belief: BeliefConfig = field(default_factory=BeliefConfig)
 
 
 @config_class

@@ -33,6 +33,7 @@ from drake_clutter.tasks.episode import SteppedBackend, make_teleport_backend_fa
 from drake_clutter.tasks.exploration_task import (
     ExplorationTask,
     MoveAttempt,
+    StopCriterion,
     TerminationReason,
     Transition,
 )
@@ -242,7 +243,8 @@ def scripted(*moves: Move) -> Policy:
 def test_an_episode_ends_when_the_policy_has_no_move(detector: LabelDetector) -> None:
     game = episode(detector, MoveResult.NOT_PLANNED)
     task = run_episode(game.backend, scripted(Move("cover 1")), max_moves=5)
-    assert ([step.move for step in task.transitions], task.termination) == ([Move("cover 1")], None)
+    assert [step.move for step in task.transitions] == [Move("cover 1")]
+    assert task.termination is TerminationReason.GAVE_UP
     assert game.backend.belief.invalid_moves == (Move("cover 1"),)
 
 
@@ -257,7 +259,7 @@ def test_an_episode_can_continue_after_all_objects_were_found_but_not_after_a_co
             game.backend,
             scripted(*moves),
             max_moves=4,
-            stop_when_all_found=until_all_found,
+            until=StopCriterion.ALL_FOUND if until_all_found else StopCriterion.LAST_MOVE,
         )
         assert len(task.transitions) == made
 

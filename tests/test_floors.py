@@ -17,7 +17,7 @@ FLOORS = {
     },
     1: {"cell", "config", "grammar"},
     2: {"rendering", "robots", "scenes", "stability"},
-    3: {"export", "simulation"},
+    3: {"belief", "export", "simulation"},
     4: {"perception", "planning"},
     5: {"tasks"},
     6: {"station"},

@@ -21,7 +21,7 @@ from drake_clutter.scenes.action_samples import CHANNELS, EXECUTED_COMMANDS
 from drake_clutter.scenes.interfaces import MoveResult
 from drake_clutter.scenes.scene_file import scene_to_dict
 from drake_clutter.tasks.episode import make_teleport_backend_factory
-from drake_clutter.tasks.exploration_task import TerminationReason
+from drake_clutter.tasks.exploration_task import StopCriterion, TerminationReason
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -43,7 +43,7 @@ def test_episode_file() -> None:
     scene = scene_of(resting("cracker_box"), resting("sugar_box", xy=(0.2, 0.2)))
     rng = np.random.default_rng(0)
     backend = make_teleport_backend_factory("static", ClutterConfig())(scene, rng)
-    task = run_episode(backend, random_explorer, max_moves=1, stop_when_all_found=False)
+    task = run_episode(backend, random_explorer, max_moves=1, until=StopCriterion.LAST_MOVE)
     written = episode_to_dict(task, "random", "static", 0)
     added = ["cell", "timing", "scenes_tried"]
     page = "reference/episode_file.md"

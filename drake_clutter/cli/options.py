@@ -17,6 +17,13 @@ class Fidelity(Enum):
     ARM = "arm"
 
 
+class Until(Enum):
+    """When an episode ends, see `StopCriterion`."""
+
+    ALL_FOUND = "all-found"
+    BELIEF = "belief"
+
+
 SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE.yaml", help="Scene file.")]
 OutOption = Annotated[
     Path,
@@ -82,6 +89,14 @@ MaxMovesOption = Annotated[
         min=1,
         max=MAX_COUNT,
         help="Maximum number of moves per episode. Default: `exploration.max_moves`, which is 10.",
+    ),
+]
+UntilOption = Annotated[
+    Until,
+    typer.Option(
+        "--until",
+        help="When an episode ends: all-found (every object has been in view, which the ground "
+        "truth decides) or belief (the agent stops by itself).",
     ),
 ]
 ExplorerOption = Annotated[

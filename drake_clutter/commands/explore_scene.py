@@ -9,6 +9,8 @@ import numpy as np
 from drake_clutter.agents.backend_factory import make_backend_factory
 from drake_clutter.agents.explorers import make_policy_factory
 from drake_clutter.agents.retrieval import RetrievingExplorer
+from drake_clutter.belief.hidden_belief import HiddenBelief
+from drake_clutter.catalog import ObjectClass
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, input_error, write_json
 from drake_clutter.perception.label_detector import LabelDetector
@@ -36,8 +38,14 @@ from drake_clutter.simulation.drake_judge import DrakeJudge
 from drake_clutter.station.arm_executor import ArmExecutor
 from drake_clutter.tasks.belief import Belief, Decision, Policy
 from drake_clutter.tasks.episode import Backend, run_episode
-from drake_clutter.tasks.exploration_task import ExplorationTask, TerminationReason, Transition
+from drake_clutter.tasks.exploration_task import (
+    ExplorationTask,
+    StopCriterion,
+    TerminationReason,
+    Transition,
+)
 from drake_clutter.tasks.search_target import require_target
+from drake_clutter.tasks.stopping import StoppingPolicy
 from drake_clutter.validation import NonEmptyText, StrictModel, to_plain, validate
 from drake_clutter.yaml_io import read_yaml
 
@@ -80,6 +88,8 @@ def explore_scene(
     target_text: str = "",
     *,
     retrieve: bool = False,
+    until: StopCriterion = StopCriterion.ALL_FOUND,
+    classes: Sequence[ObjectClass] = (),
 ) -> ExplorationTask:
     """Run an exploration episode.
 
@@ -93,6 +103,8 @@ def explore_scene(
         on_transition: Called after each move.
         target_text: What is looked for, see `find_target`; "" for all objects.
         retrieve: Whether the target is put on the hand-over place of the cell when it is seen.
+        until: When an episode without a target ends.
+        classes: Classes of the objects that there may be, for `StopCriterion.BELIEF`.
 
     Raises:
         InputError: The scene has no such target, or the policy cannot look for it, or the cell has
@@ -107,6 +119,9 @@ def explore_scene(
     policy = make_policy_factory(agent_name, config, target=target)(backend)
     if target is not None and retrieve:
         policy = RetrievingExplorer(policy, target, config.cell, config.exploration)
+    if until is StopCriterion.BELIEF:
+        empty_depth = config.cell.camera.floor_depth
+        policy = StoppingPolicy(policy, classes, empty_depth, config.exploration.belief)
     return run_episode(
         backend,
         policy,
@@ -114,6 +129,7 @@ def explore_scene(
         on_transition=on_transition,
         target=target,
         retrieve=retrieve,
+        until=until,
     )
 
 
@@ -193,7 +209,7 @@ def execute_moves(
         move_list_policy(moves, backend),
         max_moves=len(moves),
         on_transition=on_transition,
-        stop_when_all_found=False,
+        until=StopCriterion.LAST_MOVE,
     )
 
 
@@ -307,6 +323,7 @@ def episode_to_dict(task: ExplorationTask, agent: str, fidelity: str, seed: int)
                 "newly_found": list(step.newly_found),
                 "pick_probabilities": dict(step.decision.pick_probabilities),
                 "known_objects": list(step.decision.considered),
+                "hidden": hidden_to_dict(step.decision.hidden),
                 "visible_fractions": step.next_perception.visible_fractions,
                 "reward": step.reward,
             }
@@ -315,7 +332,7 @@ def episode_to_dict(task: ExplorationTask, agent: str, fidelity: str, seed: int)
         "agent": agent,
         "seed": seed,
         "fidelity": fidelity,
-        "success": end.is_success,
+        "success": task.is_success,
         "termination": end.value,
         "trajectory": TRAJECTORY_FILE if fidelity == "arm" else None,
         "num_objects": len(task.scene.objects),
@@ -325,6 +342,27 @@ def episode_to_dict(task: ExplorationTask, agent: str, fidelity: str, seed: int)
         "total_reward": sum(step.reward for step in task.transitions),
         "initial_visible_fractions": task.initial_perception.visible_fractions,
         "moves": moves,
+        "hidden_at_end": hidden_to_dict(task.last_decision.hidden if task.last_decision else None),
+    }
+
+
+def hidden_to_dict(hidden: HiddenBelief | None) -> dict[str, Any] | None:
+    """Return a belief about unseen space as a document; None without one."""
+    if hidden is None:
+        return None
+    return {
+        "nothing_left": hidden.nothing_left,
+        "supports": [
+            {
+                "carried": support.carried,
+                "is_certain": support.is_certain,
+                "gap": support.gap,
+                "classes": list(support.classes),
+            }
+            for support in hidden.supports
+        ],
+        "unidentified_points": hidden.num_unidentified_points,
+        "areas": {name: sum(area) for name, area in hidden.areas.items()},
     }
 
 

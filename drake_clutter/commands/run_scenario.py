@@ -32,9 +32,11 @@ from drake_clutter.systems.scenario import (
     make_perception,
     make_policy,
 )
+from drake_clutter.systems.station_camera import render_empty_depth
 from drake_clutter.tasks.arm_reachability_bound import ArmReachabilityBound
 from drake_clutter.tasks.episode import run_episode
-from drake_clutter.tasks.exploration_task import ExplorationTask, TerminationReason
+from drake_clutter.tasks.exploration_task import ExplorationTask, StopCriterion
+from drake_clutter.tasks.stopping import StoppingPolicy
 from drake_clutter.validation import config_yaml, to_plain
 
 MAX_DEMO_SCENES = 5
@@ -99,6 +101,15 @@ def run_closed_loop(
         The episode, and the times that it took.
     """
     policy = make_policy(scenario.agent, scenario.world, class_names(scene))
+    until = StopCriterion(scenario.until)
+    if until is StopCriterion.BELIEF:
+        catalog = load_catalog(Path(scenario.catalog) if scenario.catalog else None)
+        policy = StoppingPolicy(
+            policy,
+            catalog.smallest_set(class_names(scene)),
+            render_empty_depth(scenario.world.cell.with_support(scene.support)),
+            scenario.world.exploration.belief,
+        )
     perceive = make_perception(scenario, scene)
     closed_loop = ClosedLoop(
         scene,
@@ -108,7 +119,11 @@ def run_closed_loop(
         rate=DEFAULT_RATE,
     )
     task = run_episode(
-        closed_loop, policy, max_moves=scenario.max_moves, on_transition=on_transition
+        closed_loop,
+        policy,
+        max_moves=scenario.max_moves,
+        on_transition=on_transition,
+        until=until,
     )
     return task, closed_loop.timing
 
@@ -206,7 +221,7 @@ def run_demo(scenario: Scenario, out: Path, on_transition: TransitionCallback) -
                 scenario, index + 1, lambda scene: not arm_bound.find_unrevealable(scene)
             )
             task, timing = run_closed_loop(scenario, scene, on_transition)
-            if task.termination is TerminationReason.ALL_FOUND:
+            if task.is_success:
                 break
         return write_scenario_results(
             out,

@@ -30,7 +30,7 @@ from drake_clutter.seeding import item_rng
 from drake_clutter.station.arm_executor import ArmExecutor
 from drake_clutter.tasks.belief import Belief, Decision, Policy
 from drake_clutter.tasks.episode import SteppedBackend, run_episode
-from drake_clutter.tasks.exploration_task import TerminationReason, Transition
+from drake_clutter.tasks.exploration_task import StopCriterion, TerminationReason, Transition
 
 POLICY_ERROR = "policy error"
 """`RecordedEpisode.termination` of an episode whose policy raised an exception."""
@@ -85,7 +85,7 @@ def record_episode(
             _observed_policy(make_policy(backend), believed),
             max_moves=config.exploration.max_moves if max_moves is None else max_moves,
             on_transition=record_action,
-            stop_when_all_found=stop_when_all_found,
+            until=StopCriterion.ALL_FOUND if stop_when_all_found else StopCriterion.LAST_MOVE,
         )
         termination = (task.termination or TerminationReason.GAVE_UP).value
     except _PolicyError as raised:

@@ -183,6 +183,18 @@ def objects_below_unidentified_points(
     return frozenset(names)
 
 
+def count_unidentified_points(
+    known_objects: Sequence[SceneObject], observation: Observation, empty_depth: NDArray[np.float32]
+) -> int:
+    """Return the number of depth points of patches that belong to no known object.
+
+    Patches that are too small to form a box do not count; see `occluded_boxes` for the arguments.
+    """
+    _, patch = _unidentified_points(known_objects, observation, empty_depth)
+    sizes = np.bincount(patch) if len(patch) else np.zeros(0, int)
+    return int(sizes[sizes >= _MIN_POINTS].sum())
+
+
 def _unidentified_boxes(
     known_objects: Sequence[SceneObject], observation: Observation, empty_depth: NDArray[np.float32]
 ) -> list[OccludedBox]:

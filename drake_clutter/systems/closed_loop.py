@@ -5,7 +5,7 @@ evaluated outside of it, from the true poses.
 """
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,7 +42,7 @@ from drake_clutter.systems.planner_system import PlannerSystem
 from drake_clutter.systems.policy_system import PolicyPhase, PolicyState, PolicySystem
 from drake_clutter.systems.station_camera import add_overhead_camera, render_empty_depth
 from drake_clutter.systems.tracking import associate_detections, to_ground_truth_names
-from drake_clutter.tasks.belief import Belief, Policy
+from drake_clutter.tasks.belief import Belief, Decision, Policy
 from drake_clutter.tasks.exploration_task import MoveAttempt
 
 OBSERVATION_TO_PLAN_LATENCY = 1.15
@@ -191,7 +191,7 @@ class ClosedLoop:
         wall = time.perf_counter() - self._start_time
         return Timing(self.simulation.root.get_time(), wall, self._planning_time)
 
-    def rollout(self, policy: Policy) -> Iterator[MoveAttempt]:
+    def rollout(self, policy: Policy) -> Generator[MoveAttempt, None, Decision]:
         """Run a policy, and yield each attempt after the following observation."""
         self.policy_system.policy = policy
         self._start_time = time.perf_counter()
@@ -206,6 +206,8 @@ class ClosedLoop:
             if has_observed and previous.request.number:
                 yield self._attempt(previous, samples)
                 samples = None
+        assert state.decision is not None
+        return state.decision
 
     def _take_samples(self) -> ActionSamples | None:
         """Return the samples of a motion that has ended; None if none has, or without a rate."""

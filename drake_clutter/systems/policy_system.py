@@ -43,7 +43,7 @@ class PolicyState:
         observation_time: Time of the next observation [s].
         belief: Current belief.
         request: Latest request.
-        decision: Decision from which the request follows.
+        decision: Decision from which the request follows; once done, the one without a move.
     """
 
     phase: PolicyPhase = PolicyPhase.OBSERVING
@@ -178,7 +178,7 @@ class PolicySystem(LeafSystem):
         rng = item_rng(self._seed, number)
         decision = select_move(self.policy, belief, observation, rng, self._action_filter)
         if decision.move is None:
-            return replace(now, belief=belief, phase=PolicyPhase.DONE)
+            return replace(now, belief=belief, phase=PolicyPhase.DONE, decision=decision)
         rng = item_rng(self._seed, number)
         command = resolve_placement(decision.move, observation, self._config, rng)
         request = PlanRequest(number, decision.move, command, observation, belief.objects)

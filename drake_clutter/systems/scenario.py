@@ -3,6 +3,7 @@
 from collections.abc import Collection
 from dataclasses import field
 from pathlib import Path
+from typing import Literal
 
 from drake_clutter.agents.explorers import BASELINE_POLICIES, ORACLE, make_policy_factory
 from drake_clutter.catalog import load_catalog
@@ -31,6 +32,8 @@ class Scenario:
             a checkpoint.
         perception: Detector: labels (ground truth), depth or depth-color (learned), or file of a
             checkpoint.
+        until: When the episode ends: `all-found` (every object has been in view, which the ground
+            truth decides) or `belief` (the agent stops by itself).
         max_moves: Number of moves after which the episode ends.
         seed: Seed of all random numbers.
         world: Config of the cell, the simulation and the task.
@@ -43,6 +46,7 @@ class Scenario:
     nodes: NodeCount = 25
     agent: str = "student"
     perception: str = "labels"
+    until: Literal["all-found", "belief"] = "all-found"
     max_moves: Count = 20
     seed: Seed = 0
     world: ClutterConfig = field(default_factory=ClutterConfig)

@@ -180,11 +180,14 @@ def to_ground_truth_names(
     """
     assert decision.move is not None
     name = {TRAY: TRAY} | {o.name: nearest_object(objects, o.X_TO).name for o in known}
-    return Decision(
-        Move(name[decision.move.pick], name[decision.move.place]),
-        {name[pick]: probability for pick, probability in decision.pick_probabilities.items()},
-        tuple(name[known] for known in decision.considered),
-        observation,
+    return replace(
+        decision,
+        move=Move(name[decision.move.pick], name[decision.move.place]),
+        pick_probabilities={
+            name[pick]: probability for pick, probability in decision.pick_probabilities.items()
+        },
+        considered=tuple(name[known] for known in decision.considered),
+        observation=observation,
     )
 
 

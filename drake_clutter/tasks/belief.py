@@ -10,6 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
+from drake_clutter.belief.hidden_belief import HiddenBelief
 from drake_clutter.scenes.interfaces import Move, MoveResult, Observation
 from drake_clutter.scenes.scene import TRAY, Pose, SceneObject
 
@@ -37,12 +38,17 @@ class Decision:
         considered: Names of the objects that the choice was based on; empty for those in view.
         observation: Observation that the choice was based on, if it is not that of a perfect
             detector.
+        hidden: What unseen space may hold, with the names of the belief; None if the policy does
+            not estimate it.
+        is_stop: Whether the policy stops because nothing is left to be found.
     """
 
     move: Move | None
     pick_probabilities: Mapping[str, float] = field(default_factory=dict)
     considered: tuple[str, ...] = ()
     observation: Observation | None = field(default=None, repr=False, compare=False)
+    hidden: HiddenBelief | None = None
+    is_stop: bool = False
 
 
 @dataclass(frozen=True)

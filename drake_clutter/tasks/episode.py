@@ -1,6 +1,6 @@
 """Exploration episodes, and backends that execute the moves of a policy."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from functools import partial
 from typing import Protocol
 
@@ -35,6 +35,7 @@ from drake_clutter.tasks.belief import (
 from drake_clutter.tasks.exploration_task import (
     ExplorationTask,
     MoveAttempt,
+    StopCriterion,
     TerminationReason,
     Transition,
 )
@@ -60,10 +61,10 @@ class Backend(Protocol):
     def belief(self) -> Belief:
         """The current belief of the policy."""
 
-    def rollout(self, policy: Policy) -> Iterator[MoveAttempt]:
+    def rollout(self, policy: Policy) -> Generator[MoveAttempt, None, Decision]:
         """Execute the moves of a policy. Yield each attempt after the next observation.
 
-        The iterator ends when the policy has no move.
+        The generator ends when the policy has no move, and returns that decision.
 
         Args:
             policy: Chooses the moves.
@@ -76,9 +77,9 @@ def run_episode(
     *,
     max_moves: int,
     on_transition: Callable[[Transition], None] = lambda _: None,
-    stop_when_all_found: bool = True,
     target: SearchTarget | None = None,
     retrieve: bool = False,
+    until: StopCriterion = StopCriterion.ALL_FOUND,
 ) -> ExplorationTask:
     """Run an episode, and return its record.
 
@@ -87,16 +88,30 @@ def run_episode(
         policy: Chooses the moves.
         max_moves: Maximum number of attempted moves.
         on_transition: Called after each attempted move.
-        stop_when_all_found: Whether the episode ends when every object has been detected.
         target: What the episode looks for; None for all objects.
         retrieve: Whether the episode ends when the target is retrieved, instead of found.
+        until: When an episode without a target ends. With `StopCriterion.BELIEF` the policy must
+            stop by itself, see `StoppingPolicy`.
     """
     task = ExplorationTask(
-        backend.scene, backend.perception, backend.config, max_moves, target, retrieve=retrieve
+        backend.scene,
+        backend.perception,
+        backend.config,
+        max_moves,
+        target,
+        retrieve=retrieve,
+        until=until,
     )
-    nonterminal = (None,) if stop_when_all_found else (None, TerminationReason.ALL_FOUND)
+    nonterminal = (
+        (None, TerminationReason.ALL_FOUND) if until is StopCriterion.LAST_MOVE else (None,)
+    )
     attempts = backend.rollout(policy)
-    while task.termination in nonterminal and (attempt := next(attempts, None)) is not None:
+    while task.termination in nonterminal:
+        try:
+            attempt = next(attempts)
+        except StopIteration as end:
+            task.finish(end.value)
+            break
         on_transition(task.record(attempt))
     return task
 
@@ -212,7 +227,7 @@ class SteppedBackend:
             self.belief = self.belief.record(move, result, command.X_TO_place)
         return outcome
 
-    def rollout(self, policy: Policy) -> Iterator[MoveAttempt]:
+    def rollout(self, policy: Policy) -> Generator[MoveAttempt, None, Decision]:
         """Yield each move that the policy attempts; see `Backend.rollout`."""
         while True:
             decision = select_move(
@@ -223,7 +238,7 @@ class SteppedBackend:
                 self._action_filter,
             )
             if decision.move is None:
-                return
+                return decision
             # Before the move: the next observation may change the names of the belief.
             true_decision = self.to_ground_truth(decision)
             outcome = self.step(decision.move)

@@ -25,6 +25,7 @@ class TerminationReason(Enum):
     - `LEFT_TRAY`: An object fell off the support at the latest move.
     - `OUT_OF_MOVES`: The maximum number of moves was reached.
     - `GAVE_UP`: The policy has no further move.
+    - `NOTHING_LEFT`: The policy stopped, because its belief says that every object is known.
     """
 
     ALL_FOUND = "all found"
@@ -34,6 +35,7 @@ class TerminationReason(Enum):
     LEFT_TRAY = MoveResult.LEFT_TRAY.value
     OUT_OF_MOVES = "out of moves"
     GAVE_UP = "gave up"
+    NOTHING_LEFT = "stopped: nothing left"
 
     @property
     def is_success(self) -> bool:
@@ -48,6 +50,19 @@ class TerminationReason(Enum):
     def is_failed_move(self) -> bool:
         """Whether the latest move ruined the scene."""
         return self in (TerminationReason.COLLAPSED, TerminationReason.LEFT_TRAY)
+
+
+class StopCriterion(Enum):
+    """When an episode ends, besides a collapse and the maximum number of moves.
+
+    - `ALL_FOUND`: Every object has been in view, by ground truth.
+    - `BELIEF`: The policy stops by itself. The ground truth does not end the episode.
+    - `LAST_MOVE`: The policy has no further move, such as at the end of a list of moves.
+    """
+
+    ALL_FOUND = "all-found"
+    BELIEF = "belief"
+    LAST_MOVE = "last-move"
 
 
 @dataclass(frozen=True)
@@ -91,9 +106,9 @@ class Transition(MoveAttempt):
 class ExplorationTask:
     """Ground-truth record of an exploration episode.
 
-    An episode ends when every object has been in view, when the scene collapses or an object leaves
-    the support, or after a maximum number of moves. Objects that such a move uncovers do not count
-    as found. A move that could not be carried out counts as a move.
+    An episode ends by its `StopCriterion`, when the scene collapses or an object leaves the
+    support, or after a maximum number of moves. Objects that the last move of a ruined scene
+    uncovers do not count as found. A move that could not be carried out counts as a move.
 
     An episode with a target ends when one of its objects has been in view, or has been retrieved.
 
@@ -117,6 +132,7 @@ class ExplorationTask:
         target: SearchTarget | None = None,
         *,
         retrieve: bool = False,
+        until: StopCriterion = StopCriterion.ALL_FOUND,
     ) -> None:
         """Start the record of an episode.
 
@@ -127,11 +143,14 @@ class ExplorationTask:
             max_moves: Maximum number of moves.
             target: What the episode looks for; None for all objects.
             retrieve: Whether the episode ends when the target is retrieved, instead of found.
+            until: When an episode without a target ends.
         """
         self.target = target
         self._retrieve = retrieve
         self._config = config
         self._max_moves = max_moves
+        self._until = until
+        self._last_decision: Decision | None = None
         self.initial_scene = scene
         self.scene = scene
         self.initial_perception = initial_perception
@@ -144,21 +163,48 @@ class ExplorationTask:
 
     @property
     def termination(self) -> TerminationReason | None:
-        """Why the episode has ended; None while it continues.
-
-        `GAVE_UP` is never returned, because the task does not observe the policy.
-        """
+        """Why the episode has ended; None while it continues."""
         if self.transitions and self.transitions[-1].outcome.result.ends_episode:
             return TerminationReason(self.transitions[-1].outcome.result.value)
+        if self._last_decision is not None and self._last_decision.is_stop:
+            return TerminationReason.NOTHING_LEFT
         if self._retrieve:
             if self.transitions and self._is_retrieved(self.transitions[-1]):
                 return TerminationReason.RETRIEVED
         elif self.target is not None:
             if self.is_target_found:
                 return TerminationReason.TARGET_FOUND
-        elif len(self.detected) == len(self.scene.objects):
+        elif self.has_found_all and self._until is not StopCriterion.BELIEF:
             return TerminationReason.ALL_FOUND
-        return TerminationReason.OUT_OF_MOVES if len(self.transitions) >= self._max_moves else None
+        if len(self.transitions) >= self._max_moves:
+            return TerminationReason.OUT_OF_MOVES
+        return None if self._last_decision is None else TerminationReason.GAVE_UP
+
+    @property
+    def has_found_all(self) -> bool:
+        """Whether every object has been in view, by ground truth."""
+        return len(self.detected) == len(self.scene.objects)
+
+    @property
+    def is_success(self) -> bool:
+        """Whether the episode has reached its goal; a policy must stop when all is found."""
+        end = self.termination
+        if end is TerminationReason.NOTHING_LEFT:
+            return self.has_found_all
+        return end is not None and end.is_success
+
+    @property
+    def last_decision(self) -> Decision | None:
+        """The policy's decision without a move; None as long as it has moves."""
+        return self._last_decision
+
+    def finish(self, decision: Decision) -> None:
+        """Record that the policy has no further move.
+
+        Args:
+            decision: Its decision, without a move.
+        """
+        self._last_decision = decision
 
     @property
     def is_target_found(self) -> bool:
