@@ -139,8 +139,8 @@ class BeliefConfig:
     uncarried_probability: Annotated[float, InRange(0.0, 1.0)] = 0.99
     doubtful_probability: Annotated[float, InRange(0.0, 1.0)] = 0.3
     unidentified_probability: Annotated[float, InRange(0.0, 1.0)] = 0.99
-    covered_rate: NonNegative = 0.1
-    shadow_rate: NonNegative = 1.0
+    covered_rate: NonNegative = 0.07
+    shadow_rate: NonNegative = 0.6
 
 
 @config_class

@@ -336,7 +336,7 @@ def episode_to_dict(task: ExplorationTask, agent: str, fidelity: str, seed: int)
         "termination": end.value,
         "trajectory": TRAJECTORY_FILE if fidelity == "arm" else None,
         "num_objects": len(task.scene.objects),
-        **({} if task.target is None else {"target": target_to_dict(task)}),
+        "target": None if task.target is None else target_to_dict(task),
         "initially_hidden": list(task.initially_hidden),
         "found": list(task.found),
         "total_reward": sum(step.reward for step in task.transitions),
