@@ -16,6 +16,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -32,6 +33,8 @@ from training.script import run_script
 ADDRESSES = ("10.77.0.1", "10.77.0.2")
 """Addresses of the nodes in their own network; the first one is the head."""
 PORT = 6379
+RAY = str(Path(sys.executable).with_name("ray"))
+"""Ray's program, of the environment of this script."""
 POLL_PERIOD = 0.1
 """Period at which the size of the output is looked up [s]."""
 
@@ -130,11 +133,11 @@ def ray_cluster(first: Node, second: Node) -> Iterator[str]:
     """Start Ray with one CPU on each node and yield the address of the cluster."""
     with tempfile.TemporaryDirectory(prefix="ray_", ignore_cleanup_errors=True) as folder:
         common = ["--num-cpus", "1", "--disable-usage-stats", "--node-ip-address"]
-        head = ["ray", "start", "--head", "--port", str(PORT), "--temp-dir", folder]
+        head = [RAY, "start", "--head", "--port", str(PORT), "--temp-dir", folder]
         head += ["--include-dashboard", "false", *common, first.address]
         run(*first.command(*head))
         address = f"{first.address}:{PORT}"
-        run(*second.command("ray", "start", "--address", address, *common, second.address))
+        run(*second.command(RAY, "start", "--address", address, *common, second.address))
         try:
             yield address
         finally:

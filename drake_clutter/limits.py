@@ -18,6 +18,8 @@ MAX_NETWORK_WIDTH = 4096
 """Largest width of the embeddings of a network, at which its weights take about 1 GB."""
 MAX_IMAGE_SIDE = 4096
 """Largest width and height of an image [pixels]; its rendering takes seconds."""
+MAX_MOTION_DURATION = 3600.0
+"""Longest motion of the arm that is simulated [s]: it takes many minutes."""
 MAX_SAMPLES = 1_000_000
 """Largest number of samples of a recorded move, which last hours."""
 MAX_SAMPLE_RATE = 1000.0

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from drake_clutter.assets import build_assets
 from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig
+from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.collision_model import SignedDistance
@@ -34,8 +36,9 @@ from drake_clutter.reports.filmstrip import (
     select_key_frames,
 )
 from drake_clutter.reports.recording import motion_frames, write_recording
-from drake_clutter.scenes.interfaces import Move, MoveResult
+from drake_clutter.scenes.interfaces import Move, MoveResult, PickPlaceCommand
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
+from drake_clutter.station import station_simulation
 from drake_clutter.station.arm_executor import ArmExecutor, evaluate_outcome
 from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.command_schedule import build_command_schedule
@@ -141,6 +144,31 @@ def test_an_object_is_not_lifted_without_a_seal(plan: PickPlacePlan) -> None:
     result = run(plan, cell_with("gripper.unevenness=0"))
     assert not result.grasped
     assert result.poses["sugar_box"].p == pytest.approx(SCENE["sugar_box"].X_TO.p, abs=0.001)
+
+
+def test_a_motion_that_does_not_end_is_given_up(
+    plan: PickPlacePlan, config: ClutterConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The arm waits half a second for the vacuum of a slow pump, but may be late by 0.2 s only."""
+    monkeypatch.setattr(station_simulation, "MAX_OVERTIME", 0.2)
+    slow = cell_with("gripper.pump_time_constant=5")
+    executor = ArmExecutor(replace(config, cell=slow))
+    monkeypatch.setattr(executor, "plan", lambda *_: plan)
+    command = PickPlaceCommand(Move("sugar_box"), SCENE["sugar_box"].X_TO, PLACE)
+    outcome = executor.execute(SCENE, command, rng())
+    assert outcome.result is MoveResult.INCONCLUSIVE
+    assert outcome.samples is None
+    assert outcome.scene is SCENE
+    found = re.fullmatch(r"the motion had not ended after (\S+) s", outcome.detail)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(plan.duration + 0.2, abs=0.03)
+
+
+def test_a_motion_of_hours_is_refused(plan: PickPlacePlan) -> None:
+    schedule = replace(build_command_schedule(plan, DEFAULT_CELL), end_time=1e9)
+    simulation = StationSimulation(DEFAULT_CELL, SCENE, movable=frozenset())
+    with pytest.raises(InputError, match=r"plan: takes 1e\+09 s; expected at most 3600 s"):
+        simulation.execute(plan, schedule)
 
 
 @pytest.mark.parametrize(

@@ -11,15 +11,10 @@ from drake_clutter.grammar import Orientation
 from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.recording.exact_replay import compare_samples, replay_action
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.simulation.scene_plant import rigid_transform
-from drake_clutter.station.station_simulation import (
-    COARSE_TIME_STEP,
-    StationSimulation,
-    simulate_plan,
-)
+from drake_clutter.station.station_simulation import StationSimulation
 
 GRIPPER = ParallelJawGripper(kind="parallel_jaw")
 SAMPLING = GraspSampling(spacing=0.012, lip_gap=0.0005, max_grasps=9, min_payload_acceleration=0.3)
@@ -107,23 +102,6 @@ def test_friction_holds_a_box_from_pick_to_place(cell: WorkCell) -> None:
     assert result.slip < 0.003
     assert result.position_error < 0.003
     assert result.poses["sugar_box"].p[2] == pytest.approx(0.0875, abs=0.001)
-
-
-def test_closing_jaws_wake_no_other_object(cell: WorkCell) -> None:
-    """The other box would be woken if the object counted as lost while the jaws still close."""
-    scene = scene_of(
-        resting("sugar_box", Orientation.UPRIGHT_0), resting("gelatin_box", xy=(-0.2, 0))
-    )
-    plan = planned(cell, [*scene.objects], "sugar_box", PlannerConfig(optimize=False))
-    assert isinstance(plan, PickPlacePlan)
-    samples = simulate_plan(cell, scene, plan, rate=125.0).samples
-    assert samples is not None
-    assert samples.time_step == COARSE_TIME_STEP
-    assert samples.movable == ("sugar_box",)
-    assert (samples.held_object == 0).any()
-    errors = compare_samples(samples, replay_action(scene, cell, samples, 125.0))
-    assert errors.joint < 1e-9  # [rad]: the ramps of the jaws are interpolated
-    assert errors.object < 1e-6
 
 
 def test_jaws_without_an_object_are_open(cell: WorkCell) -> None:

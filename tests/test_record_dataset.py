@@ -5,16 +5,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from conftest import CATALOG, DEFAULT_CELL, WORLD, resting, scene_of
 from typer.testing import CliRunner
 
+from drake_clutter.cell.work_cell import load_cell
 from drake_clutter.cli.app import app
 from drake_clutter.commands.episode_scenes import FileScenes, find_scenes
 from drake_clutter.commands.record_dataset import EpisodeSummary, episode_path, record_dataset
 from drake_clutter.commands.recording_job import CameraOptions, RecordingJob
 from drake_clutter.files import InputError
+from drake_clutter.grammar import Orientation
 from drake_clutter.recording.camera_recorder import CameraChannel
 from drake_clutter.recording.exact_replay import (
     compare_samples,
@@ -23,8 +26,10 @@ from drake_clutter.recording.exact_replay import (
 )
 from drake_clutter.recording.hdf5_file import load_episode
 from drake_clutter.recording.randomization import load_randomization
+from drake_clutter.resources import resource_path
 from drake_clutter.scenes.interfaces import Move, MoveResult, Observation
 from drake_clutter.scenes.scene_file import save_scene
+from drake_clutter.station.station_simulation import COARSE_TIME_STEP
 from drake_clutter.tasks.belief import Belief, Decision
 
 CAMERAS = CameraOptions(("wrist",), (CameraChannel.RGB, CameraChannel.SEGMENTATION), (64, 48))
@@ -125,6 +130,36 @@ def test_an_episode_with_other_masses_is_replayed(dataset: Path) -> None:
     broken = replace(episode, variation={"mass": {"box": -1.0}})
     with pytest.raises(InputError, match=r"mass.*: -1.0"), recorded_physics(broken):
         pass
+
+
+def test_a_move_of_jaws_is_recorded_and_replayed(tmp_path: Path) -> None:
+    """The other box would be woken if the object counted as lost while the jaws still close."""
+    cell = load_cell(resource_path("models/cells/ur10_2f85_tray.yaml"))
+    config = replace(WORLD, cell=cell)
+    scene = scene_of(
+        resting("sugar_box", Orientation.UPRIGHT_0, name="box"),
+        resting("gelatin_box", xy=(-0.2, 0.0), name="other"),
+    )
+    (tmp_path / "scenes").mkdir()
+    save_scene(tmp_path / "scenes/jaws.yaml", scene, cell)
+    scenes = find_scenes(str(tmp_path / "scenes"), config)
+    job = RecordingJob(scenes, (Move("box"),), config, max_moves=1)
+    record_dataset(job, 1, [], tmp_path / "out")
+    path = episode_path(tmp_path / "out", 0)
+    episode = load_episode(path, CATALOG)
+    (action,) = episode.actions
+    assert action.result is MoveResult.PLACED
+    samples = action.samples
+    assert samples is not None
+    assert samples.time_step == COARSE_TIME_STEP
+    assert samples.movable == ("box",)
+    with h5py.File(path) as file:
+        columns = file["action_0001/gripper_commanded"].attrs["columns"].tolist()
+    assert columns == ["left_jaw_guide", "right_jaw_guide"]
+    replayed = replay_action(episode.initial_scene, episode.cell, samples, episode.rate)
+    errors = compare_samples(samples, replayed)
+    assert errors.joint < 1e-9  # [rad]: the ramps of the jaws are interpolated
+    assert errors.object < 1e-6
 
 
 def test_a_missing_episode_is_recorded_again_with_the_same_bytes(

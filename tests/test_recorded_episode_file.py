@@ -198,6 +198,12 @@ def replace_dataset(file: h5py.Group, name: str, values: np.ndarray) -> None:
             r"action_0002/executed.step_start: expected a dataset of shape \(4,\)",
         ),
         (
+            lambda f: replace_dataset(
+                f, "action_0002/executed/step_start", np.array([0.0, 0.2, 0.3, 1e9])
+            ),
+            "action_0002.executed: expected .* that do not decrease, from 0 to at most 3600 s",
+        ),
+        (
             lambda f: f["action_0001"].attrs.update({"result": "lost"}),
             "action_0001: result: 'lost'; expected one of placed",
         ),

@@ -17,6 +17,7 @@ from drake_clutter.feasibility.move_study import PLANNED, MoveRecord
 from drake_clutter.planning.pick_place_plan import PlanningFailure
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.scenes.interfaces import MoveResult
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.seeding import item_rng
 from drake_clutter.simulation.scene_plant import pose_from_transform, rigid_transform
@@ -144,6 +145,8 @@ class NoiseStudy:
         if kind is NoiseKind.MASS:
             scale_mass(simulation, record.pick, max(0.1, 1 + rng.normal(0.0, size)))
         result = simulation.execute(plan)
+        if not result.has_ended:
+            return NoiseRecord(*of_move, MoveResult.INCONCLUSIVE.value, str(result))
         # The gripper takes the object where it is, so it arrives with the error of its pose.
         X_moved = rigid_transform(X_TO_place) @ rigid_transform(picked.X_TO).inverse()
         X_TO_end = pose_from_transform(X_moved @ rigid_transform(scene[record.pick].X_TO))

@@ -100,7 +100,8 @@ def replay_action(
         rate: Samples per second [Hz].
 
     Raises:
-        InputError: The samples are without the commands between them, as those of version 1.
+        InputError: The samples are without the commands between them, as those of version 1, or
+            with so many waits that the arm does not move.
     """
     executed = samples.executed
     if executed is None:
@@ -113,10 +114,12 @@ def replay_action(
     simulation = StationSimulation(
         cell, start, movable={*samples.movable}, time_step=samples.time_step, rate=rate
     )
-    replayed = simulation.execute(plan, schedule).samples
+    result = simulation.execute(plan, schedule)
     simulation.release()
-    assert replayed is not None
-    return replayed
+    if not result.has_ended:
+        raise InputError(f"samples: {result}; expected recorded commands that end")
+    assert result.samples is not None
+    return result.samples
 
 
 def _recorded_schedule(

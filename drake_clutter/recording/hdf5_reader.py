@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_clutter.files import InputError, format_value, input_error
-from drake_clutter.limits import MAX_IMAGE_SIDE, MAX_SAMPLES
+from drake_clutter.limits import MAX_IMAGE_SIDE, MAX_MOTION_DURATION, MAX_SAMPLES
 from drake_clutter.recording.recorded_episode import CameraImages, RecordedAction
 from drake_clutter.scenes.action_samples import (
     CHANNELS,
@@ -212,8 +212,10 @@ class ActionReader:
         }
         self._check_times(self._source_of(group, "time"), arrays["time"])
         starts = arrays["step_start"]
-        if num_knots < 2 or starts[0] != 0 or (np.diff(starts) < 0).any():
-            allowed = "at least 2 commands, and starts that do not decrease, from 0"
+        is_ordered = starts[0] == 0 and (np.diff(starts) >= 0).all()
+        if num_knots < 2 or not is_ordered or starts[-1] > MAX_MOTION_DURATION:
+            allowed = "at least 2 commands, and starts that do not decrease, from 0 to at most "
+            allowed += f"{MAX_MOTION_DURATION:g} s"
             raise input_error(f"{self._source}.executed", f"expected {allowed}")
         self._check_indices(group, arrays, {"step_phase": len(PHASES), "step_tool": num_tools})
         return ExecutedCommands(**arrays)

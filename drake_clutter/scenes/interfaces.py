@@ -212,7 +212,8 @@ class MoveResult(Enum):
         COLLAPSED: The scene is unstable after the move.
         LEFT_TRAY: An object fell off the support.
         NO_FREE_PLACEMENT: No placement is known to be free.
-        INCONCLUSIVE: The executor's model does not cover the scene.
+        INCONCLUSIVE: The executor's model does not cover the scene, or a simulated motion has not
+            ended in time.
         NOT_PLANNED: No motion plan was found.
         DROPPED: The gripper lost the object on the way.
     """

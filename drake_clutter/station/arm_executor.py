@@ -84,6 +84,8 @@ class ArmExecutor:
                 failure_reason=plan.reason.value,
             )
         result = simulate_plan(self._config.cell, scene, plan, rate=self._rate)
+        if not result.has_ended:
+            return Outcome(MoveResult.INCONCLUSIVE, scene, detail=str(result))
         # The arm lowers the object beyond its planned pose until contact.
         X_TO_place = plan.X_TO_place.translated((0.0, 0.0, -result.lowered_distance))
         after = scene.with_poses(result.poses)

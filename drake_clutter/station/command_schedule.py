@@ -50,8 +50,14 @@ class CommandSchedule:
 
     @property
     def held_time(self) -> float:
-        """Time from which a tool holds its object [s]: jaws close first."""
-        return self.grasp_time + (JAW_MOVING_TIME if self.num_actuated else 0.0)
+        """Time from which a tool holds its object [s]: the end of the dwell of the grasp.
+
+        Vacuum has to build up, and jaws have to close. Infinite if no object is grasped.
+        """
+        ends = (*self.starts[1:], self.end_time)
+        return next(
+            (end for end, step in zip(ends, self.steps, strict=True) if step.tool), math.inf
+        )
 
     @property
     def release_time(self) -> float:

@@ -10,7 +10,7 @@ result = simulation.execute(plan)
 
 import math
 from collections.abc import Callable, Mapping, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.files import InputError, format_value
+from drake_clutter.limits import MAX_MOTION_DURATION
 from drake_clutter.planning.motion_plan import Plan
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.scenes.action_samples import ActionSamples
@@ -56,6 +57,11 @@ update of the plant belongs to it; less than a time step."""
 _GRIPPER_UPDATES_PER_STEP = round(STEP_PERIOD / GRIPPER_UPDATE_PERIOD)
 MAX_START_ERROR = 1e-4
 """Largest difference between the commanded joints and the start of a plan [rad]."""
+MAX_OVERTIME = 60.0
+"""Time beyond the duration of a plan after which its execution is given up [s].
+
+It is longer than the arm may wait for the vacuum of a few grasps.
+"""
 POST_MOTION_WAIT = 1.0
 """Time after the end of a plan in which fallen objects stay awake [s]."""
 
@@ -86,6 +92,7 @@ class PickPlaceResult:
         max_tracking_error: Largest tracking error of a joint [rad].
         simulated_time: Simulation time at the end [s].
         samples: Recorded samples; None if not recorded.
+        has_ended: Whether the plan has ended within `MAX_OVERTIME` of its duration.
     """
 
     poses: dict[str, Pose]
@@ -100,6 +107,7 @@ class PickPlaceResult:
     max_tracking_error: float
     simulated_time: float
     samples: ActionSamples | None = field(repr=False, default=None)
+    has_ended: bool = True
 
     @property
     def lost_object(self) -> bool:
@@ -110,13 +118,16 @@ class PickPlaceResult:
     def is_uneventful(self) -> bool:
         """Whether the object was held and rests at its place pose, and no other one has moved."""
         return (
-            not self.lost_object
+            self.has_ended
+            and not self.lost_object
             and self.position_error <= MAX_COARSE_DISPLACEMENT
             and self.orientation_error <= MAX_COARSE_TILT
             and max(self.displacements.values(), default=0.0) <= MAX_COARSE_DISPLACEMENT
         )
 
     def __str__(self) -> str:
+        if not self.has_ended:
+            return f"the motion had not ended after {self.simulated_time:.2f} s"
         if not self.grasped:
             return "the gripper did not grasp the object"
         if not math.isnan(self.drop_time):
@@ -329,6 +340,9 @@ class StationSimulation:
     def execute(self, plan: Plan, schedule: CommandSchedule | None = None) -> PickPlaceResult:
         """Execute a plan until its end, and for `SETTLE_TIME` more.
 
+        A plan that has not ended `MAX_OVERTIME` after its duration is given up, see
+        `PickPlaceResult.has_ended`.
+
         The diagram must not have been built with `add_systems` that connect the executor.
 
         Args:
@@ -336,10 +350,16 @@ class StationSimulation:
             schedule: Commands; None for those that follow from the plan.
 
         Raises:
-            InputError: The plan does not start at the commanded joint positions, or a step names
-                an unknown tool.
+            InputError: The plan does not start at the commanded joint positions, is longer than
+                `MAX_MOTION_DURATION`, or a step names an unknown tool.
         """
         self._check_start(plan)
+        steps = plan.steps
+        duration = sum(s.duration for s in steps) if schedule is None else schedule.end_time
+        if not duration <= MAX_MOTION_DURATION:
+            allowed = f"at most {MAX_MOTION_DURATION:g} s"
+            raise InputError(f"plan: takes {duration:g} s; expected {allowed}")
+        last_step = self._num_steps + math.ceil((duration + MAX_OVERTIME) / STEP_PERIOD)
         before = self.scene
         number = self.executor_state.number + 1
         context = self.executor.GetMyMutableContextFromRoot(self.root)
@@ -348,6 +368,8 @@ class StationSimulation:
         if self.recorder is not None:
             self.recorder.clear()
         while self.finished_plan != number or not self.is_at_rest:
+            if self._num_steps >= last_step:
+                return replace(self._result(plan, before, max_tracking_error), has_ended=False)
             self.step()
             max_tracking_error = max(max_tracking_error, self._tracking_error())
         return self._result(plan, before, max_tracking_error)
