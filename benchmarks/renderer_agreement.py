@@ -51,7 +51,7 @@ from drake_clutter.simulation.cell_plant import add_work_cell, joint_state_indic
 from drake_clutter.simulation.drop import sample_drop_scene
 from drake_clutter.simulation.plant_rasterizer import PlantRasterizer
 from drake_clutter.simulation.scene_plant import add_scene_plant
-from training.render_image_dataset import sample_lights
+from training.image_randomization import sample_lights
 from training.results_file import Row, provenance
 from training.script import ROOT, SCENES, ResultsOption, SeedOption, print_table, run_script
 

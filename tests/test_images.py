@@ -27,8 +27,9 @@ from drake_clutter.perception.image_dataset import (
     write_images,
 )
 from drake_clutter.rendering.lighting import LampKind
+from drake_clutter.rendering.mesh_renderer import RenderedImages
 from drake_clutter.rendering.visual_mesh import box_visual, load_visual_meshes
-from drake_clutter.scenes.scene import SceneObject
+from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.camera_renderer import CameraRenderer
 from drake_clutter.simulation.drop import sample_drop_scene, simulate_drop
 
@@ -245,6 +246,37 @@ def test_masks_conform_to_bop(tmp_path: Path, images: list[AnnotatedImage]) -> N
             assert np.all(seen < corner_depths.max() + 1)
 
 
+def test_compact_images(tmp_path: Path, images: list[AnnotatedImage]) -> None:
+    """Colors are nearly those that were written; depth, labels and annotations are the same."""
+    for name in ("plain", "compact"):
+        write_images(
+            tmp_path / name / "000000",
+            images,
+            DEFAULT_CELL.camera,
+            list(CLASSES),
+            compact=name == "compact",
+        )
+    plain, compact = (ImageDataset(tmp_path / name) for name in ("plain", "compact"))
+    assert len(compact) == len(images)
+    for k in range(len(images)):
+        assert np.array_equal(compact[k].depth, plain[k].depth)
+        assert np.array_equal(compact[k].label, plain[k].label)
+        difference = np.abs(compact[k].color.astype(int) - plain[k].color)
+        assert np.median(difference) <= 2
+        assert np.quantile(difference, 0.99) < 25
+    folder = tmp_path / "compact" / "000000"
+    assert not list(folder.glob("mask*"))
+    coco = json.loads((folder / "scene_gt_coco.json").read_text())
+    assert all((folder / entry["file_name"]).is_file() for entry in coco["images"])
+    reference = json.loads((tmp_path / "plain" / "000000" / "scene_gt_coco.json").read_text())
+    assert coco["annotations"] == reference["annotations"]
+    sizes = [
+        sum(f.stat().st_size for f in (tmp_path / name).rglob("*.*"))
+        for name in ("plain", "compact")
+    ]
+    assert sizes[1] < sizes[0]
+
+
 def test_models_conform_to_bop(tmp_path: Path) -> None:
     """Meshes are in mm in the frame O, with normals and texture; the camera file is complete."""
     write_dataset_camera(tmp_path, DEFAULT_CELL.camera)
@@ -306,6 +338,7 @@ def test_the_same_seed_generates_the_same_dataset(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     script = training_script("render_image_dataset")
+    monkeypatch.setattr(script, "DISMANTLINGS", 1)
     monkeypatch.setattr(script, "GENERATED_IMAGES", 2)
     monkeypatch.setattr(script, "NODES", 10)
     monkeypatch.setattr(script, "GENERATORS", {"random": ""})
@@ -329,8 +362,9 @@ def test_the_same_seed_generates_the_same_dataset(
 
 
 def test_images_of_the_compiled_renderer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The camera moves from item to item, and the poses are given for where it was."""
+    """The camera moves between dismantlings, and the poses are given for where it was."""
     script = training_script("render_image_dataset")
+    monkeypatch.setattr(script, "DISMANTLINGS", 2)
     monkeypatch.setattr(script, "GENERATED_IMAGES", 2)
     monkeypatch.setattr(script, "NODES", 10)
     monkeypatch.setattr(script, "GENERATORS", {"random": ""})
@@ -364,11 +398,13 @@ def test_images_of_the_compiled_renderer(tmp_path: Path, monkeypatch: pytest.Mon
                 checked += 1
     assert len(positions) == 2
     assert checked >= 8
+    with pytest.raises(InputError, match="--textures unseen: expected --renderer raster"):
+        script.main(tmp_path / "new", textures=script.TextureSet.UNSEEN)
 
 
 def test_lamps_of_a_room() -> None:
     """A tray that faces each lamp gets 1.5 to 4 in all, divided by the cosine at most."""
-    script = training_script("render_image_dataset")
+    script = training_script("image_randomization")
     for seed in range(50):
         lighting = script.sample_room_lighting(rng(seed))
         assert 1 <= len(lighting.lamps) <= 3
@@ -385,7 +421,8 @@ def test_lamps_of_a_room() -> None:
 
 
 def test_patches_on_textures(monkeypatch: pytest.MonkeyPatch) -> None:
-    script = training_script("render_image_dataset")
+    script = training_script("image_randomization")
+    monkeypatch.setattr(script, "PRINT_PROBABILITY", 0.0)
     (mesh,) = load_visual_meshes(CLASSES["sugar_box"].folder / "visual.gltf")
     plain = box_visual((0.1, 0.1, 0.1), (0.5, 0.5, 0.5))
     variation = script.TextureVariation(3)
@@ -400,6 +437,82 @@ def test_patches_on_textures(monkeypatch: pytest.MonkeyPatch) -> None:
     assert 0.02 < factors.std() < 0.25
     monkeypatch.setattr(script, "MAX_PATCH_CONTRAST", 0.0)
     assert np.array_equal(variation("sugar_box", mesh).texture, mesh.texture)
+
+
+def test_random_prints(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Prints hide the texture; those for tests are of other kinds than those for training."""
+    script = training_script("image_randomization")
+    training, unseen = (set(script.PRINTS[textures]) for textures in script.TextureSet)
+    assert len(training) == len(unseen) == 3
+    assert not training & unseen
+    for make_print in training | unseen:
+        pictures = [make_print(rng(seed)) for seed in (1, 1, 2)]
+        assert pictures[0].shape == (script.PRINT_SIDE, script.PRINT_SIDE, 3)
+        assert pictures[0].dtype == np.uint8
+        assert len(np.unique(pictures[0].reshape(-1, 3), axis=0)) >= 2
+        assert np.array_equal(pictures[0], pictures[1])
+        assert not np.array_equal(pictures[0], pictures[2])
+    monkeypatch.setattr(script, "PRINT_PROBABILITY", 0.0)
+    monkeypatch.setattr(script, "MAX_PATCH_CONTRAST", 0.0)
+    (mesh,) = load_visual_meshes(CLASSES["sugar_box"].folder / "visual.gltf")
+    printed = script.TextureVariation(1, script.TextureSet.UNSEEN)("sugar_box", mesh).texture
+    differs = (printed != mesh.texture).any(axis=2)
+    assert differs.mean() > 0.9
+
+
+def test_colors_of_instances() -> None:
+    """Each instance has its own affine map, which clips; the background is replaced."""
+    script = training_script("image_randomization")
+    color = np.full((4, 6, 3), 100, np.uint8)
+    label = np.full((4, 6), -1)
+    label[1, 2:4] = 0
+    label[2, 2:4] = 1
+    depth = np.ones((4, 6), np.float32)
+    depth[:, 5] = np.inf
+    images = RenderedImages(color, depth, label)
+    changed = script.randomize_colors(images, 2, rng(4))
+    for mask in (label == 0, label == 1, (label < 0) & np.isfinite(depth)):
+        assert len(np.unique(changed[mask], axis=0)) == 1
+        # Gray is on the axis of the hue rotation: gain 0.7 to 1.34, offset -15 to 15.
+        assert np.all((changed[mask] > 54) & (changed[mask] < 150))
+    assert len({tuple(changed[k]) for k in ((1, 2), (2, 2), (0, 0))}) == 3
+    white = replace(images, color=np.full((4, 6, 3), 255, np.uint8))
+    assert script.randomize_colors(white, 2, rng(4)).max() == 255
+
+
+def test_stacks_are_turned_about_themselves() -> None:
+    script = training_script("render_image_dataset")
+    below = resting("cracker_box", xy=(0.0, 0.0), name="below")
+    above = resting("gelatin_box", xy=(0.0, 0.0), name="above")
+    above = replace(above, X_TO=Pose((0.0, 0.0, below.top_height + above.X_TO.p[2])))
+    beside = resting("sugar_box", xy=(0.25, 0.25), name="beside")
+    scene = scene_of(above, below, beside)
+    turned = script.turn_stacks(scene, rng(2))
+    assert turned.names == scene.names
+    for name in scene.names:
+        assert turned[name].X_TO.p[2] == scene[name].X_TO.p[2]
+        assert np.abs(turned[name].X_TO.rotation[:2, :2]).max() < 0.999, "not turned"
+        assert (np.abs(np.array(turned[name].bounds_T)[:, :2]) < TRAY.half_size).all()
+    relative = [s["below"].X_TO.rotation.T @ s["above"].X_TO.rotation for s in (scene, turned)]
+    assert relative[1] == pytest.approx(relative[0], abs=1e-9)
+    crowded = scene_of(
+        *(resting("sugar_box", xy=(x, 0.0), name=f"{x}") for x in np.linspace(-0.3, 0.3, 7))
+    )
+    assert script.turn_stacks(crowded, rng(2)).objects == crowded.objects, "no room"
+
+
+def test_objects_are_put_on_others() -> None:
+    script = training_script("render_image_dataset")
+    box = resting("cracker_box", name="box")
+    can = resting("tomato_soup_can", xy=(0.2, 0.2), name="can")
+    for seed in range(5):
+        placed = script.place_on_object(can, scene_of(box), rng(seed))
+        assert placed.bounds_T[0][2] == pytest.approx(box.top_height)
+        assert np.all(np.abs(placed.X_TO.p[:2]) <= 0.3 * np.ptp(box.bounds_T, axis=0)[:2])
+    assert (
+        script.place_on_object(can, scene_of(box, resting("cracker_box", name="other")), rng(1))
+        is None
+    )
 
 
 def test_a_mirrored_pose_is_refused(tmp_path: Path, images: list[AnnotatedImage]) -> None:

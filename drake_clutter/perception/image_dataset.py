@@ -7,11 +7,12 @@ The folder of a dataset holds what all images share, see `drake_clutter.percepti
 
 Each folder in `train/`, such as `000000/`, holds the images of one scene:
 
-    rgb/000000.png         Color image.
+    rgb/000000.png         Color image; a JPEG file in compact datasets.
     depth/000000.png       Rendered depth without noise, uint16 [0.1 mm]; 0 where there is none.
     label/000000.png       Instance number of each pixel, uint8; 255: none. For the detector.
-    mask/000000_000000.png Silhouette of each instance alone: 255 in it, 0 elsewhere.
-    mask_visib/...         Visible part of each silhouette.
+    mask/000000_000000.png Silhouette of each instance alone: 255 in it, 0 elsewhere. Not in
+                           compact datasets.
+    mask_visib/...         Visible part of each silhouette. Not in compact datasets.
     scene_camera.json      Per image: cam_K, depth_scale, cam_R_w2c, cam_t_w2c [mm] (X_CT).
     scene_gt.json          Per instance: obj_id, cam_R_m2c, cam_t_m2c [mm] (X_CO).
     scene_gt_info.json     Per instance: px_count_all, px_count_valid, px_count_visib, visib_fract,
@@ -67,6 +68,12 @@ INFO_FILE = "scene_gt_info.json"
 COCO_FILE = "scene_gt_coco.json"
 MAX_INSTANCES = 255
 """Largest number of instances in an image, whose numbers are 0 to 254."""
+JPEG_QUALITY = 92
+"""Quality of color images of compact datasets.
+
+At 640 x 480 pixels they take 45 kB, a fifth of a PNG file, and differ from it by 1 of 255 at the
+median.
+"""
 _CONTENT = "annotations in the format of BOP"
 """What the JSON files may contain, for messages."""
 _NO_INSTANCE = 255
@@ -129,7 +136,12 @@ def encode_depth(depth: NDArray[np.floating[Any]]) -> NDArray[np.uint16]:
 
 
 def write_images(
-    folder: Path, images: Iterable[AnnotatedImage], camera: Camera, class_names: Sequence[str]
+    folder: Path,
+    images: Iterable[AnnotatedImage],
+    camera: Camera,
+    class_names: Sequence[str],
+    *,
+    compact: bool = False,
 ) -> None:
     """Write the images of one scene to a folder that appears once it is complete.
 
@@ -138,13 +150,16 @@ def write_images(
         images: Images of the scene, with at most `MAX_INSTANCES` instances each.
         camera: Camera of the images.
         class_names: Names of the classes of the catalog, in its order.
+        compact: Whether color images are compressed with losses and mask images are left out, which
+            are two files for each instance. The visible masks are in `COCO_FILE` as well.
 
     Raises:
         InputError: An image has more than `MAX_INSTANCES` instances.
     """
     temporary = folder.with_name(f".{folder.name}")
     shutil.rmtree(temporary, ignore_errors=True)
-    for kind in (COLOR_FOLDER, DEPTH_FOLDER, LABEL_FOLDER, MASK_FOLDER, VISIBLE_MASK_FOLDER):
+    mask_folders = () if compact else (MASK_FOLDER, VISIBLE_MASK_FOLDER)
+    for kind in (COLOR_FOLDER, DEPTH_FOLDER, LABEL_FOLDER, *mask_folders):
         (temporary / kind).mkdir(parents=True)
     camera_entry = _camera_entry(camera)
     camera_entries = dict[str, Any]()
@@ -160,7 +175,11 @@ def write_images(
                 f"{folder}: an image of {len(image.classes)} instances; "
                 f"allowed are at most {MAX_INSTANCES}"
             )
-        _write_png(image.color, temporary / COLOR_FOLDER / name)
+        color_file = f"{COLOR_FOLDER}/{number:06d}{'.jpg' if compact else '.png'}"
+        if compact:
+            Image.fromarray(image.color).save(temporary / color_file, quality=JPEG_QUALITY)
+        else:
+            _write_png(image.color, temporary / color_file)
         depth = encode_depth(image.depth)
         _write_png(depth, temporary / DEPTH_FOLDER / name)
         label = np.where(image.label < 0, _NO_INSTANCE, image.label)
@@ -171,7 +190,7 @@ def write_images(
             for k, X in zip(ids, image.X_TO, strict=True)
         ]
         info = _visibility_info(annotated, depth)
-        for instance, silhouette in enumerate(annotated.silhouettes):
+        for instance, silhouette in enumerate(() if compact else annotated.silhouettes):
             mask_name = f"{number:06d}_{instance:06d}.png"
             _write_mask(silhouette, temporary / MASK_FOLDER / mask_name)
             _write_mask(image.label == instance, temporary / VISIBLE_MASK_FOLDER / mask_name)
@@ -181,7 +200,7 @@ def write_images(
         coco_images.append(
             {
                 "id": number,
-                "file_name": f"{COLOR_FOLDER}/{name}",
+                "file_name": color_file,
                 "width": camera.width,
                 "height": camera.height,
             }
@@ -276,12 +295,12 @@ def _pose_in_camera(X_TO: Pose, camera: Camera) -> dict[str, list[float]]:
 
 def _bounding_box(mask: NDArray[np.bool_]) -> list[int]:
     """Return the left column, upper row, width and height of a mask; all -1 if it is empty."""
-    rows, columns = np.nonzero(mask)
+    rows = np.flatnonzero(mask.any(axis=1))
+    columns = np.flatnonzero(mask.any(axis=0))
     if not rows.size:
         return [-1, -1, -1, -1]
-    width = int(np.ptp(columns)) + 1
-    height = int(np.ptp(rows)) + 1
-    return [int(columns.min()), int(rows.min()), width, height]
+    left, top = int(columns[0]), int(rows[0])
+    return [left, top, int(columns[-1]) - left + 1, int(rows[-1]) - top + 1]
 
 
 def _visibility_info(annotated: AnnotatedImage, depth: NDArray[np.uint16]) -> list[dict[str, Any]]:
@@ -318,9 +337,9 @@ class ImageDataset:
         split = folder / TRAIN_FOLDER if (folder / TRAIN_FOLDER).is_dir() else folder
         scenes = sorted(path for path in split.glob("[0-9]*") if (path / COCO_FILE).is_file())
         self._files = [
-            (scene, path.stem)
+            (scene, path.name)
             for scene in scenes
-            for path in sorted((scene / COLOR_FOLDER).glob("*.png"))
+            for path in sorted((scene / COLOR_FOLDER).glob("[0-9]*"))
         ]
         if not self._files:
             raise InputError(
@@ -340,17 +359,18 @@ class ImageDataset:
         Raises:
             InputError: A file cannot be read, or does not belong to the others.
         """
-        scene, name = self._files[index]
+        scene, color_name = self._files[index]
+        name = Path(color_name).stem
         key = name.lstrip("0") or "0"
         camera_entry = _entry_of_image(_read_cameras, scene / CAMERA_FILE, key)
         instances = _entry_of_image(_read_poses, scene / POSES_FILE, key)
         infos = _entry_of_image(_read_infos, scene / INFO_FILE, key)
-        color = _read_png(scene / COLOR_FOLDER / f"{name}.png")
-        stored_depth = _read_png(scene / DEPTH_FOLDER / f"{name}.png")
+        color = _read_image(scene / COLOR_FOLDER / color_name)
+        stored_depth = _read_image(scene / DEPTH_FOLDER / f"{name}.png")
         meters = np.float32(camera_entry.depth_scale / 1000)
         depth = stored_depth.astype(np.float32) * meters
         depth[depth == 0] = np.inf
-        label = _read_png(scene / LABEL_FOLDER / f"{name}.png").astype(np.int64)
+        label = _read_image(scene / LABEL_FOLDER / f"{name}.png").astype(np.int64)
         label[label == _NO_INSTANCE] = -1
         size = label.shape
         if len(size) != 2 or depth.shape != size or color.shape != (*size, 3):
@@ -452,8 +472,8 @@ def _entry_of_image(read: Callable[[Path], Mapping[str, Entry]], path: Path, key
     return entries[key]
 
 
-def _read_png(path: Path) -> NDArray[Any]:
-    with reading_file(path, "a PNG image"), Image.open(path) as image:
+def _read_image(path: Path) -> NDArray[Any]:
+    with reading_file(path, "an image"), Image.open(path) as image:
         if image.width > MAX_IMAGE_SIDE or image.height > MAX_IMAGE_SIDE:
             raise ValueError(f"{image.width} x {image.height} pixels")
         return np.array(image)
