@@ -116,6 +116,30 @@ class PlacementConfig:
 
 
 @config_class
+class TouchConfig:
+    """Errors of what the gripper feels, for the class of an object.
+
+    Attributes:
+        mass_error: Standard deviation of the measured mass [kg].
+        relative_mass_error: The same, as a fraction of the mass.
+        height_error: Standard deviation of the height at touch-down [m].
+        top_face_error: Largest error of the sides of the top that the camera sees [m].
+        outlier_fraction: Fraction of measurements that say nothing, as of an object on another.
+        no_seal_probability: Probability that the gripper does not grasp an object of the believed
+            class.
+        no_seal_otherwise: The same for an object of another class.
+    """
+
+    mass_error: Annotated[float, InRange(1e-6, 10.0)] = 0.010
+    relative_mass_error: NonNegative = 0.05
+    height_error: Annotated[float, InRange(1e-6, 1.0)] = 0.003
+    top_face_error: NonNegative = 0.010
+    outlier_fraction: Annotated[float, InRange(0.0, 1.0)] = 0.05
+    no_seal_probability: Annotated[float, InRange(0.0, 1.0)] = 0.05
+    no_seal_otherwise: Annotated[float, InRange(0.0, 1.0)] = 0.5
+
+
+@config_class
 class BeliefConfig:
     """When a policy takes every object for known, and stops.
 
@@ -132,6 +156,7 @@ class BeliefConfig:
         covered_rate: Expected number of unseen objects below known ones that carry nothing, by area
             of their possible positions [1/m^2].
         shadow_rate: The same for unseen objects that are open above, but behind known ones [1/m^2].
+        touch: Errors of what the gripper feels.
     """
 
     stop_probability: Annotated[float, InRange(0.0, 1.0)] = 0.95
@@ -141,6 +166,7 @@ class BeliefConfig:
     unidentified_probability: Annotated[float, InRange(0.0, 1.0)] = 0.99
     covered_rate: NonNegative = 0.07
     shadow_rate: NonNegative = 0.6
+    touch: TouchConfig = field(default_factory=TouchConfig)
 
 
 @config_class

@@ -8,7 +8,7 @@ import pytest
 from conftest import CLASSES, DEFAULT_CELL, resting, rng, scene_of
 
 from drake_clutter.agents.explorers import BASELINE_POLICIES
-from drake_clutter.belief.class_belief import normal_likelihood, update_probabilities
+from drake_clutter.belief.class_belief import Touch, touch_likelihoods, update_probabilities
 from drake_clutter.belief.hidden_belief import HiddenBelief, estimate_hidden
 from drake_clutter.belief.hidden_space import find_fits, find_hidden_columns, hidden_area
 from drake_clutter.belief.known_supports import (
@@ -18,9 +18,10 @@ from drake_clutter.belief.known_supports import (
     resting_heights,
     stack_heights,
 )
-from drake_clutter.config import BeliefConfig, ClutterConfig
+from drake_clutter.config import BeliefConfig, ClutterConfig, TouchConfig
 from drake_clutter.grammar import Orientation
 from drake_clutter.perception.ray_detector import RayDetector
+from drake_clutter.reports.belief_html import belief_html
 from drake_clutter.scenes.free_space import CELL_SIZE, Grid
 from drake_clutter.scenes.interfaces import Move, Observation
 from drake_clutter.scenes.scene import SceneObject
@@ -258,7 +259,61 @@ def test_bayes_rule() -> None:
     assert update_probabilities(prior, dict.fromkeys(prior, 0.0)) == prior
 
 
-def test_normal_likelihood() -> None:
-    peak = 1 / (0.1 * np.sqrt(2 * np.pi))
-    assert normal_likelihood(0.0, 0.1, 0.02) == pytest.approx(peak + 0.02)
-    assert normal_likelihood(0.2, 0.1, 0.0) == pytest.approx(peak * np.exp(-2))
+def touch_odds(believed: SceneObject, touch: Touch, other: str) -> float:
+    """Return the likelihood of the believed class relative to another one."""
+    classes = [believed.object_class, CLASSES[other]]
+    likelihoods = touch_likelihoods(believed, touch, classes, TouchConfig())
+    return likelihoods[believed.object_class.name] / likelihoods[other]
+
+
+def test_the_weight_tells_a_pudding_box_from_a_sugar_box() -> None:
+    """187 g and 514 g: 12 deviations of 27 g apart; outliers keep the odds finite."""
+    pudding = resting("pudding_box", Orientation.SIDE_0)
+    assert touch_odds(pudding, Touch(mass=0.187), "sugar_box") > 100
+    assert touch_odds(pudding, Touch(mass=0.514), "sugar_box") < 0.01
+    assert touch_odds(pudding, Touch(), "sugar_box") == 1.0
+
+
+def test_the_likelihood_of_a_weight_is_normal_with_outliers() -> None:
+    """Deviation of the pudding box: hypot(10 g, 5 % of 187 g) = 13.7 g."""
+    pudding = resting("pudding_box")
+    sugar = CLASSES["sugar_box"]
+    likelihoods = touch_likelihoods(
+        pudding, Touch(mass=0.187 + 0.0137), [pudding.object_class, sugar], TouchConfig()
+    )
+    deviation = np.hypot(0.010, 0.05 * 0.187)
+    density = np.exp(-0.5 * (0.0137 / deviation) ** 2) / (deviation * np.sqrt(2 * np.pi))
+    assert likelihoods["pudding_box"] == pytest.approx(0.95 * density + 0.05 / 0.514)
+
+
+def test_the_height_at_touch_down_tells_boxes_with_the_same_top_apart() -> None:
+    """On end, a pudding box shows 35 x 89 mm and is 110 mm high; a sugar box 38 x 89 and 175."""
+    pudding = resting("pudding_box", Orientation.UPRIGHT_0)
+    assert touch_odds(pudding, Touch(excess_height=0.0), "sugar_box") > 100
+    assert touch_odds(pudding, Touch(excess_height=0.065), "sugar_box") < 0.01
+    # A sugar box lies 38 mm high, too, but shows another top then.
+    assert touch_odds(pudding, Touch(excess_height=0.038 - 0.110), "sugar_box") == pytest.approx(
+        1.0
+    )
+
+
+def test_no_seal_speaks_against_the_believed_class() -> None:
+    odds = touch_odds(resting("cracker_box"), Touch(has_sealed=False), "sugar_box")
+    assert odds == pytest.approx(0.05 / 0.5)
+
+
+# --- Page ---
+
+
+def test_the_page_says_what_must_carry_a_box() -> None:
+    can = resting("tomato_soup_can")
+    box = resting("cracker_box", floor=can.top_height)
+    html = belief_html(believed([box], can).to_dict(), "Belief <before>")
+    assert html.startswith("<h4>Belief &lt;before&gt;</h4>")
+    assert "Cracker box stands on something hidden, 101 mm above" in html
+    assert "Tomato soup can" in html
+    assert "Master chef can" not in html
+    assert "depth points" not in html
+    sure = belief_html(HiddenBelief(0.98).to_dict(), "Belief at the end")
+    assert "98 %" in sure
+    assert "<li>" not in sure

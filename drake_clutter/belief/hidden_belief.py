@@ -6,7 +6,8 @@ where the camera sees nothing, if it fits in there.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +66,17 @@ class HiddenBelief:
     supports: tuple[HiddenSupport, ...] = ()
     num_unidentified_points: int = 0
     areas: Mapping[str, HiddenArea] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the belief as a document, see `docs/reference/episode_file.md`."""
+        return {
+            "nothing_left": self.nothing_left,
+            "supports": [
+                {**asdict(support), "classes": list(support.classes)} for support in self.supports
+            ],
+            "unidentified_points": self.num_unidentified_points,
+            "areas": {name: sum(area) for name, area in self.areas.items()},
+        }
 
 
 def estimate_hidden(

@@ -9,7 +9,6 @@ import numpy as np
 from drake_clutter.agents.backend_factory import make_backend_factory
 from drake_clutter.agents.explorers import make_policy_factory
 from drake_clutter.agents.retrieval import RetrievingExplorer
-from drake_clutter.belief.hidden_belief import HiddenBelief
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, input_error, write_json
@@ -308,6 +307,12 @@ def target_to_dict(task: ExplorationTask) -> dict[str, Any]:
     }
 
 
+def hidden_document(decision: Decision | None) -> dict[str, Any] | None:
+    """Return what unseen space may hide at a decision; None if the policy does not estimate it."""
+    hidden = None if decision is None else decision.hidden
+    return None if hidden is None else hidden.to_dict()
+
+
 def episode_to_dict(task: ExplorationTask, agent: str, fidelity: str, seed: int) -> dict[str, Any]:
     """Return the document of `episode.json`."""
     end = task.termination or TerminationReason.GAVE_UP
@@ -323,7 +328,7 @@ def episode_to_dict(task: ExplorationTask, agent: str, fidelity: str, seed: int)
                 "newly_found": list(step.newly_found),
                 "pick_probabilities": dict(step.decision.pick_probabilities),
                 "known_objects": list(step.decision.considered),
-                "hidden": hidden_to_dict(step.decision.hidden),
+                "hidden": hidden_document(step.decision),
                 "visible_fractions": step.next_perception.visible_fractions,
                 "reward": step.reward,
             }
@@ -342,27 +347,7 @@ def episode_to_dict(task: ExplorationTask, agent: str, fidelity: str, seed: int)
         "total_reward": sum(step.reward for step in task.transitions),
         "initial_visible_fractions": task.initial_perception.visible_fractions,
         "moves": moves,
-        "hidden_at_end": hidden_to_dict(task.last_decision.hidden if task.last_decision else None),
-    }
-
-
-def hidden_to_dict(hidden: HiddenBelief | None) -> dict[str, Any] | None:
-    """Return a belief about unseen space as a document; None without one."""
-    if hidden is None:
-        return None
-    return {
-        "nothing_left": hidden.nothing_left,
-        "supports": [
-            {
-                "carried": support.carried,
-                "is_certain": support.is_certain,
-                "gap": support.gap,
-                "classes": list(support.classes),
-            }
-            for support in hidden.supports
-        ],
-        "unidentified_points": hidden.num_unidentified_points,
-        "areas": {name: sum(area) for name, area in hidden.areas.items()},
+        "hidden_at_end": hidden_document(task.last_decision),
     }
 
 

@@ -14,6 +14,7 @@ from PIL import Image
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.files import atomic_write, write_text
 from drake_clutter.perception.label_detector import PerceptionResult
+from drake_clutter.reports.belief_html import belief_html
 from drake_clutter.reports.detection_image import draw_detections
 from drake_clutter.reports.filmstrip import render_frames, select_key_frames
 from drake_clutter.reports.recording import episode_frames, motion_frames, write_recording
@@ -120,7 +121,7 @@ def write_episode_page(
         recording_note=_recording_note(steps),
         start=initial_scene_html,
         legend=_legend_html(),
-        moves="\n".join(moves) or "<p>No move was made.</p>",
+        moves=("\n".join(moves) or "<p>No move was made.</p>") + _end_html(summary),
         summary=escape(json.dumps(summary, indent=2)),
     )
     write_text(out / "index.html", page)
@@ -209,10 +210,28 @@ def _move_html(
         f'<div class="pair">'
         f"{_overhead_figures(images, number, scene, perception, step, found_so_far)}</div>"
         f"{_arm_figures(images, number, scene, step, cell)}"
+        f"{_hidden_html(step)}"
         f"{_pick_probabilities_html(step, scene)}"
         f"<h4>Visible fraction of each object, before &rarr; after the move (hidden below "
         f"{threshold:.0%})</h4>{bars}</article>"
     )
+
+
+def _hidden_html(step: Transition) -> str:
+    """Return the belief before a move; nothing if the policy does not estimate it."""
+    hidden = step.decision.hidden
+    if hidden is None:
+        return ""
+    return belief_html(hidden.to_dict(), "Belief before the move")
+
+
+def _end_html(summary: Mapping[str, Any]) -> str:
+    """Return the part of the page about the belief at which the agent stopped, if it did."""
+    hidden = summary.get("hidden_at_end")
+    if hidden is None:
+        return ""
+    title = f"<h3>{escape(str(summary['termination']))}</h3>"
+    return f"<article>{title}{belief_html(hidden, 'Belief at the end')}</article>"
 
 
 def _notes_html(step: Transition) -> str:
