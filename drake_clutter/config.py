@@ -123,7 +123,6 @@ class TouchConfig:
         mass_error: Standard deviation of the measured mass [kg].
         relative_mass_error: The same, as a fraction of the mass.
         height_error: Standard deviation of the height at touch-down [m].
-        top_face_error: Largest error of the sides of the top that the camera sees [m].
         outlier_fraction: Fraction of measurements that say nothing, as of an object on another.
         no_seal_probability: Probability that the gripper does not grasp an object of the believed
             class.
@@ -133,7 +132,6 @@ class TouchConfig:
     mass_error: Annotated[float, InRange(1e-6, 10.0)] = 0.010
     relative_mass_error: NonNegative = 0.05
     height_error: Annotated[float, InRange(1e-6, 1.0)] = 0.003
-    top_face_error: NonNegative = 0.010
     outlier_fraction: Annotated[float, InRange(0.0, 1.0)] = 0.05
     no_seal_probability: Annotated[float, InRange(0.0, 1.0)] = 0.05
     no_seal_otherwise: Annotated[float, InRange(0.0, 1.0)] = 0.5

@@ -8,7 +8,12 @@ import pytest
 from conftest import CLASSES, DEFAULT_CELL, resting, rng, scene_of
 
 from drake_clutter.agents.explorers import BASELINE_POLICIES
-from drake_clutter.belief.class_belief import Touch, touch_likelihoods, update_probabilities
+from drake_clutter.belief.class_belief import (
+    Touch,
+    pose_with_same_top,
+    touch_likelihoods,
+    update_probabilities,
+)
 from drake_clutter.belief.hidden_belief import HiddenBelief, estimate_hidden
 from drake_clutter.belief.hidden_space import find_fits, find_hidden_columns, hidden_area
 from drake_clutter.belief.known_supports import (
@@ -23,10 +28,11 @@ from drake_clutter.grammar import Orientation
 from drake_clutter.perception.ray_detector import RayDetector
 from drake_clutter.reports.belief_html import belief_html
 from drake_clutter.scenes.free_space import CELL_SIZE, Grid
-from drake_clutter.scenes.interfaces import Move, Observation
+from drake_clutter.scenes.interfaces import Move, MoveResult, Observation
 from drake_clutter.scenes.scene import SceneObject
+from drake_clutter.tasks.belief import Belief
 from drake_clutter.tasks.episode import make_teleport_backend_factory, run_episode
-from drake_clutter.tasks.exploration_task import StopCriterion, TerminationReason
+from drake_clutter.tasks.exploration_task import ExplorationTask, StopCriterion, TerminationReason
 from drake_clutter.tasks.stopping import StoppingPolicy
 
 CAMERA = DEFAULT_CELL.camera
@@ -201,17 +207,15 @@ def test_expected_numbers_of_hidden_objects_multiply() -> None:
 # --- Episodes ---
 
 
-def stopping(policy_name: str, **fields: float) -> StoppingPolicy:
-    """Return a baseline that stops by itself."""
-    return StoppingPolicy(BASELINE_POLICIES[policy_name], YCB7, EMPTY, replace(CONFIG, **fields))
-
-
-def run(*objects: SceneObject, max_moves: int = 5, **fields: float):  # type: ignore[no-untyped-def]
+def run(
+    *objects: SceneObject, max_moves: int = 5, config: BeliefConfig = CONFIG
+) -> ExplorationTask:
     """Return the task of an episode that the belief ends."""
     make_backend = make_teleport_backend_factory("static", ClutterConfig())
+    policy = StoppingPolicy(BASELINE_POLICIES["largest-clear"], YCB7, EMPTY, config)
     return run_episode(
         make_backend(scene_of(*objects), rng(0)),
-        stopping("largest-clear", **fields),
+        policy,
         max_moves=max_moves,
         until=StopCriterion.BELIEF,
     )
@@ -236,7 +240,7 @@ def test_an_agent_stops_without_a_move_where_all_is_seen() -> None:
 
 def test_the_ground_truth_does_not_end_an_episode_of_a_doubting_agent() -> None:
     box = resting("cracker_box", Orientation.UPRIGHT_90, xy=(0.2, 0.0))  # it hides a marker's place
-    task = run(box, max_moves=1, covered_rate=1e9, shadow_rate=1e9)
+    task = run(box, max_moves=1, config=replace(CONFIG, covered_rate=1e9, shadow_rate=1e9))
     assert len(task.transitions) == 1
     assert task.has_found_all
     assert (task.termination, task.is_success) == (TerminationReason.OUT_OF_MOVES, False)
@@ -244,7 +248,8 @@ def test_the_ground_truth_does_not_end_an_episode_of_a_doubting_agent() -> None:
 
 def test_an_early_stop_is_no_success() -> None:
     can = resting("tomato_soup_can")
-    task = run(can, resting("cracker_box", floor=can.top_height), stop_probability=0.0)
+    box = resting("cracker_box", floor=can.top_height)
+    task = run(can, box, config=replace(CONFIG, stop_probability=0.0))
     assert task.termination is TerminationReason.NOTHING_LEFT
     assert not task.is_success
 
@@ -263,7 +268,7 @@ def touch_odds(believed: SceneObject, touch: Touch, other: str) -> float:
     """Return the likelihood of the believed class relative to another one."""
     classes = [believed.object_class, CLASSES[other]]
     likelihoods = touch_likelihoods(believed, touch, classes, TouchConfig())
-    return likelihoods[believed.object_class.name] / likelihoods[other]
+    return likelihoods[believed.object_class] / likelihoods[CLASSES[other]]
 
 
 def test_the_weight_tells_a_pudding_box_from_a_sugar_box() -> None:
@@ -283,7 +288,7 @@ def test_the_likelihood_of_a_weight_is_normal_with_outliers() -> None:
     )
     deviation = np.hypot(0.010, 0.05 * 0.187)
     density = np.exp(-0.5 * (0.0137 / deviation) ** 2) / (deviation * np.sqrt(2 * np.pi))
-    assert likelihoods["pudding_box"] == pytest.approx(0.95 * density + 0.05 / 0.514)
+    assert likelihoods[pudding.object_class] == pytest.approx(0.95 * density + 0.05 / 0.514)
 
 
 def test_the_height_at_touch_down_tells_boxes_with_the_same_top_apart() -> None:
@@ -300,6 +305,58 @@ def test_the_height_at_touch_down_tells_boxes_with_the_same_top_apart() -> None:
 def test_no_seal_speaks_against_the_believed_class() -> None:
     odds = touch_odds(resting("cracker_box"), Touch(has_sealed=False), "sugar_box")
     assert odds == pytest.approx(0.05 / 0.5)
+
+
+def test_the_touch_revises_the_class_of_the_next_detection() -> None:
+    """A box shows 35 x 89 mm at 175 mm: a sugar box on end, or a pudding box on something.
+
+    The detector prefers the pudding box by 7 to 3. The weight of 514 g decides otherwise.
+    """
+    sugar, pudding = CLASSES["sugar_box"], CLASSES["pudding_box"]
+    believed = resting("pudding_box", Orientation.UPRIGHT_90, xy=(0.1, 0.2), floor=0.065)
+    belief = Belief((believed,))
+    felt = touch_likelihoods(believed, Touch(mass=0.514), [sugar, pudding], TouchConfig())
+    move = Move("pudding_box")
+    belief = belief.record(move, MoveResult.PLACED, believed.X_TO, touch=felt)
+    assert belief.touch == {"pudding_box": felt}
+    observation = seen(resting("sugar_box", Orientation.UPRIGHT_90, xy=(0.1, 0.2)))
+    probabilities = {"pudding_box": 0.7, "sugar_box": 0.3}
+    detection = replace(
+        observation.detections[0],
+        object_class=pudding,
+        X_TO=believed.X_TO,
+        class_probabilities=probabilities,
+    )
+    observation = replace(observation, detections=(detection,))
+    belief, revised = belief.revise(observation)
+    (known,) = belief.objects
+    assert known.object_class is revised.detections[0].object_class is sugar
+    expected = resting("sugar_box", Orientation.UPRIGHT_90, xy=(0.1, 0.2))
+    assert known.X_TO == revised.detections[0].X_TO
+    assert known.X_TO.p == pytest.approx(expected.X_TO.p, abs=1e-9)
+    assert known.bounds_T[0] == pytest.approx(expected.bounds_T[0], abs=1e-9)
+    certain = replace(observation, detections=(replace(detection, class_probabilities={}),))
+    assert Belief((believed,)).revise(observation)[1].detections[0].object_class is pudding
+    assert belief.revise(certain)[1].detections[0].object_class is pudding
+
+
+def test_likelihoods_of_several_moves_multiply() -> None:
+    box = resting("pudding_box")
+    felt = {CLASSES["pudding_box"]: 0.5, CLASSES["sugar_box"]: 0.25}
+    belief = Belief((box,))
+    for _ in range(2):
+        belief = belief.record(Move("pudding_box"), MoveResult.PLACED, box.X_TO, touch=felt)
+    assert belief.touch["pudding_box"] == {c: value**2 for c, value in felt.items()}
+    assert belief.remove(["pudding_box"]).touch == {}
+
+
+def test_a_class_that_shows_another_top_is_not_taken() -> None:
+    can = resting("tomato_soup_can")
+    assert pose_with_same_top(can, CLASSES["cracker_box"]) is None
+    on_end = resting("pudding_box", Orientation.UPRIGHT_0, floor=0.065)
+    X_TO = pose_with_same_top(on_end, CLASSES["sugar_box"])
+    assert X_TO is not None
+    assert X_TO.p == pytest.approx([0.0, 0.0, 0.0875])
 
 
 # --- Page ---

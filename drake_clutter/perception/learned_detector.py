@@ -285,9 +285,24 @@ class LearnedDetector:
                     candidate.fitted.X_TO,
                     mask,
                     is_confident,
+                    self._class_probabilities(predictions, cells),
                 )
             )
         return Observation(clean_depth, tuple(detections), self._camera, self._support)
+
+    def _class_probabilities(
+        self, predictions: _CellPredictions, cells: NDArray[np.bool_]
+    ) -> dict[str, float]:
+        """Return the mean class probabilities of the cells of a detection, see `Detection`."""
+        if not cells.any():
+            return {}
+        mean = predictions.class_probabilities[:, cells].mean(axis=1)
+        named = {
+            name: float(p)
+            for name, p in zip(self._network.classes, mean, strict=True)
+            if name in self._classes
+        }
+        return named | {"": max(0.0, 1.0 - sum(named.values()))}
 
     def _propose_segments(
         self, masks: Sequence[Mask], predictions: _CellPredictions, image_shape: tuple[int, int]

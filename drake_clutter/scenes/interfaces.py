@@ -313,6 +313,8 @@ class Detection:
         mask: Pixels of the object. Shape (height, width), bool.
         is_confident: Whether all evidence supports the detection. Without confidence, an earlier
             estimate of the object may be better.
+        class_probabilities: Probability of each class by its name, and of no object by ""; empty if
+            the class is certain.
     """
 
     name: str
@@ -320,6 +322,7 @@ class Detection:
     X_TO: Pose
     mask: NDArray[np.bool_]
     is_confident: bool = False
+    class_probabilities: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

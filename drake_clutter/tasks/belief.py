@@ -9,9 +9,12 @@ from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
+from drake_clutter.belief.class_belief import pose_with_same_top, revise_class
 from drake_clutter.belief.hidden_belief import HiddenBelief
-from drake_clutter.scenes.interfaces import Move, MoveResult, Observation
+from drake_clutter.catalog import ObjectClass
+from drake_clutter.scenes.interfaces import Detection, Move, MoveResult, Observation
 from drake_clutter.scenes.scene import TRAY, Pose, SceneObject
 
 UNMOVED_TOLERANCE = 0.01
@@ -19,6 +22,10 @@ UNMOVED_TOLERANCE = 0.01
 
 A pose estimate is more accurate than this, and a placement moves an object farther.
 """
+
+
+MAX_TOP_DISTANCE = 0.03
+"""Largest distance of the tops of a detection and of the known object that it may be [m]."""
 
 
 def legal_moves(observation: Observation) -> list[Move]:
@@ -62,19 +69,36 @@ class Belief:
         invalid_moves: Moves that could not be carried out since the belief last changed.
         previous_pose: Pose X_TO of the object of the latest move before it was placed, until the
             next observation shows whether it has moved; otherwise None.
+        ungrasped: Objects as they were believed when the gripper did not grasp them. None of them
+            is picked again as long as it is believed to be the same.
+        touch: Likelihood of what the gripper felt in all moves of an object, by its name and class.
     """
 
     objects: tuple[SceneObject, ...] = ()
     history: tuple[Move, ...] = ()
     invalid_moves: tuple[Move, ...] = ()
     previous_pose: Pose | None = None
+    ungrasped: tuple[SceneObject, ...] = ()
+    touch: Mapping[str, Mapping[ObjectClass, float]] = field(default_factory=dict)
 
     def update(self, observation: Observation) -> "Belief":
         """Return the belief after an observation.
 
         Objects in view are at their detected poses. If the object of the latest move is detected
-        where it was before the move, it was not picked, and all its moves become invalid.
+        where it was before the move, it was not picked, and all its moves become invalid. So are
+        those of an object that the gripper did not grasp, as long as it is believed to be the same.
         """
+        updated = self._with_detections(observation)
+        ungrasped = {
+            d.name for d in observation.detections if any(_is_same(d, o) for o in self.ungrasped)
+        }
+        moves = [move for move in legal_moves(observation) if move.pick in ungrasped]
+        known_moves = set(updated.invalid_moves)
+        added = tuple(move for move in moves if move not in known_moves)
+        return replace(updated, invalid_moves=(*updated.invalid_moves, *added))
+
+    def _with_detections(self, observation: Observation) -> "Belief":
+        """Return the belief after an observation, apart from objects that were not grasped."""
         objects = {o.name: o for o in self.objects}
         for d in observation.detections:
             known_object = objects.get(d.name)
@@ -96,14 +120,26 @@ class Belief:
         invalid_moves = (*self.invalid_moves, *moves_of_picked) if moves_of_picked else ()
         return replace(updated, invalid_moves=invalid_moves)
 
-    def record(self, move: Move, result: MoveResult, X_TO_place: Pose | None = None) -> "Belief":
+    def record(
+        self,
+        move: Move,
+        result: MoveResult,
+        X_TO_place: Pose | None = None,
+        touch: Mapping[ObjectClass, float] | None = None,
+    ) -> "Belief":
         """Return the belief after a move.
 
         Args:
             move: The attempted move.
             result: Its result, as far as the explorer can observe it.
             X_TO_place: Pose at which the object was released, if it was placed.
+            touch: Likelihood of what the gripper felt, by class; None if it felt nothing.
         """
+        if touch is not None:
+            earlier = self.touch.get(move.pick, {})
+            product = {c: value * earlier.get(c, 1.0) for c, value in touch.items()}
+            felt = replace(self, touch={**self.touch, move.pick: product})
+            return felt.record(move, result, X_TO_place)
         history = (*self.history, move)
         if not result.was_executed:
             return replace(self, history=history, invalid_moves=(*self.invalid_moves, move))
@@ -127,7 +163,49 @@ class Belief:
         invalid_moves = tuple(
             move for move in self.invalid_moves if not {move.pick, move.place} & set(names)
         )
-        return replace(self, objects=objects, invalid_moves=invalid_moves)
+        touch = {name: values for name, values in self.touch.items() if name not in names}
+        return replace(self, objects=objects, invalid_moves=invalid_moves, touch=touch)
+
+    def revise(self, observation: Observation) -> "tuple[Belief, Observation]":
+        """Return belief and observation with the classes that the gripper's touch suggests.
+
+        A detection at the top of a known object that the gripper has felt gets the class that is
+        most probable by both, if an object of that class can show such a top, and so does the known
+        object.
+
+        Args:
+            observation: Observation with arbitrary names of the detections.
+        """
+        objects = {o.name: o for o in self.objects}
+        detections = list(observation.detections)
+        for name, likelihoods in self.touch.items():
+            top = _top_center(objects[name])
+            for k, d in enumerate(detections):
+                seen = SceneObject(d.name, d.object_class, d.X_TO)
+                if np.linalg.norm(_top_center(seen) - top) > MAX_TOP_DISTANCE:
+                    continue
+                revised = revise_class(d.object_class, d.class_probabilities, likelihoods)
+                if revised is d.object_class:
+                    X_TO: Pose | None = d.X_TO
+                else:
+                    X_TO = pose_with_same_top(seen, revised)
+                if X_TO is not None:
+                    detections[k] = replace(d, object_class=revised, X_TO=X_TO)
+                    if objects[name].object_class is not revised:
+                        objects[name] = replace(objects[name], object_class=revised, X_TO=X_TO)
+        belief = replace(self, objects=tuple(objects.values()))
+        return belief, replace(observation, detections=tuple(detections))
+
+
+def _top_center(o: SceneObject) -> NDArray[np.float64]:
+    """Return the point at an object's highest level above its origin [m]. Shape (3,)."""
+    return np.array([*o.X_TO.translation[:2], o.top_height])
+
+
+def _is_same(detection: Detection, o: SceneObject) -> bool:
+    """Return whether a detection is an object as it was believed."""
+    distance = float(np.linalg.norm(detection.X_TO.p - o.X_TO.p))
+    return detection.object_class is o.object_class and distance < UNMOVED_TOLERANCE
 
 
 class Policy(Protocol):
@@ -186,6 +264,7 @@ def update_belief(
         The belief, and the observation with the names of the belief.
     """
     if tracker is not None:
+        belief, observation = belief.revise(observation)
         observation, lost = tracker(belief.objects, observation)
         belief = belief.remove(lost)
     return belief.update(observation), observation
