@@ -19,7 +19,7 @@ from drake_clutter.systems.scenario import Scenario
 from drake_clutter.tasks.generation_task import GenerationTaskConfig
 from drake_clutter.validation import load_config_as
 from training import train_detector
-from training.training_loop import train_to_end
+from training.training_loop import CheckpointSpec, train_to_end
 
 
 class DivergingLearner:
@@ -52,6 +52,7 @@ def test_a_diverging_training_names_the_step_and_keeps_the_last_state(tmp_path: 
             run,
             learner,
             5,
+            CheckpointSpec("network.safetensors", {"kind": "test"}, lambda row: -row["loss"]),
             train_iteration=learner.train_iteration,
             evaluate=lambda: ({}, {"loss": 0.5}),
             evaluate_every=1,

@@ -9,7 +9,7 @@ from drake_clutter.agents.learned_explorer import explorer_metadata
 from drake_clutter.agents.ppo import PPOLearner
 from drake_clutter.learning.training_run import TrainingRun
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
-from training.training_loop import Metrics, train_to_end
+from training.training_loop import CheckpointSpec, Metrics, train_to_end
 
 
 def train_explorer(
@@ -20,6 +20,7 @@ def train_explorer(
     *,
     kind: str,
     total_steps: int,
+    steps_field: str,
     evaluate_every: int,
     input_files: Sequence[Path],
 ) -> None:
@@ -32,10 +33,17 @@ def train_explorer(
         learner: Learning algorithm.
         kind: Kind of the checkpoint: teacher or student.
         total_steps: Number of steps of the learner after which the training ends.
+        steps_field: Field of the configuration that holds `total_steps`.
         evaluate_every: Steps between two evaluations and saved states.
         input_files: Files that the training reads, whose hashes the checkpoint records.
     """
-    run = TrainingRun(out, training, learner, total_steps, input_files)
+    run = TrainingRun(out, training, learner, total_steps, input_files, steps_field=steps_field)
+    network_metadata = explorer_metadata(
+        environment.node_kind_ids,
+        learner.config.width,
+        finds_target=environment.target_text is not None,
+    )
+    metadata = {"kind": kind, "network": network_metadata}
 
     def evaluate() -> tuple[Metrics, Metrics]:
         return training.evaluate(environment, learner.network), learner.losses
@@ -44,14 +52,9 @@ def train_explorer(
         run,
         learner,
         total_steps,
+        CheckpointSpec(CHECKPOINT_FILE, metadata, lambda metrics: metrics["score"]),
         train_iteration=learner.train_iteration,
         evaluate=evaluate,
         evaluate_every=evaluate_every,
         save_every=evaluate_every,
     )
-    network_metadata = explorer_metadata(
-        environment.node_kind_ids,
-        learner.config.width,
-        finds_target=environment.target_text is not None,
-    )
-    run.finish(CHECKPOINT_FILE, learner.network, {"kind": kind, "network": network_metadata})

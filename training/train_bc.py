@@ -47,7 +47,7 @@ from training.script import (
     print_table,
     run_script,
 )
-from training.training_loop import Metrics, OutOption, train_to_end
+from training.training_loop import CheckpointSpec, Metrics, OutOption, train_to_end
 
 CHECKPOINT = "policy.safetensors"
 """File name of the trained policy in the folder of a run."""
@@ -70,7 +70,13 @@ def train(
     learner = CloningLearner(network, learned, training)
     scale = StateSampler(learned, perturb=False).action_scale
     network.action_scale.copy_(torch.from_numpy(scale))
-    run = TrainingRun(out, training, learner, training.steps)
+    run = TrainingRun(out, training, learner, training.steps, steps_field="steps")
+    metadata = {
+        "kind": CHECKPOINT_KIND,
+        "observation": training.observation,
+        "num_joints": num_joints,
+        "moves": len(learned),
+    }
     shown = StateSampler(held_out, perturb=False).all_states()
     images = [d.image for d in held_out if d.image is not None]
 
@@ -88,18 +94,12 @@ def train(
         run,
         learner,
         training.steps,
+        CheckpointSpec(CHECKPOINT, metadata, lambda metrics: -metrics["held_out"]),
         train_iteration=learner.train_iteration,
         evaluate=evaluate,
         evaluate_every=training.evaluate_every,
         save_every=training.evaluate_every,
     )
-    metadata = {
-        "kind": CHECKPOINT_KIND,
-        "observation": training.observation,
-        "num_joints": num_joints,
-        "moves": len(learned),
-    }
-    run.finish(CHECKPOINT, network, metadata)
 
 
 def _usable(

@@ -45,7 +45,13 @@ from training.script import (
     run_script,
     settings_with_catalog,
 )
-from training.training_loop import DeviceOption, Metrics, OutOption, train_to_end
+from training.training_loop import (
+    CheckpointSpec,
+    DeviceOption,
+    Metrics,
+    OutOption,
+    train_to_end,
+)
 
 CHECKPOINT = "detector.safetensors"
 """File name of the trained network in the folder of the run."""
@@ -177,7 +183,13 @@ def main(
         training.seed,
         torch_device,
     )
-    run = TrainingRun(out, training, learner, training.learning.steps)
+    run = TrainingRun(out, training, learner, training.learning.steps, steps_field="learning.steps")
+    metadata = {
+        "kind": CHECKPOINT_KIND,
+        "classes": classes,
+        "use_color": training.use_color,
+        "images": num_training_images,
+    }
     held_out = HeldOutImages(
         images, range(num_training_images, len(images)), classes, training, torch_device
     )
@@ -189,18 +201,12 @@ def main(
         run,
         learner,
         training.learning.steps,
+        CheckpointSpec(CHECKPOINT, metadata, lambda metrics: metrics["iou"]),
         train_iteration=learner.train_iteration,
         evaluate=evaluate,
         evaluate_every=training.evaluate_every,
         save_every=training.evaluate_every,
     )
-    metadata = {
-        "kind": CHECKPOINT_KIND,
-        "classes": classes,
-        "use_color": training.use_color,
-        "images": num_training_images,
-    }
-    run.finish(CHECKPOINT, network, metadata)
 
 
 if __name__ == "__main__":

@@ -83,6 +83,7 @@ def main(
         learner,
         kind=STUDENT,
         total_steps=training.learning.iterations,
+        steps_field="learning.iterations",
         evaluate_every=training.evaluate_every,
         input_files=[Path(training.scenes), path],
     )

@@ -90,6 +90,7 @@ def main(
         learner,
         kind=kind,
         total_steps=training.learning.total_timesteps,
+        steps_field="learning.total_timesteps",
         evaluate_every=training.evaluate_every,
         input_files=[Path(file) for file in (training.scenes, training.warm_start) if file],
     )

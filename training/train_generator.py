@@ -54,7 +54,13 @@ from training.script import (
     run_script,
     settings_with_catalog,
 )
-from training.training_loop import DeviceOption, Metrics, OutOption, train_to_end
+from training.training_loop import (
+    CheckpointSpec,
+    DeviceOption,
+    Metrics,
+    OutOption,
+    train_to_end,
+)
 
 CHECKPOINT = "generator.safetensors"
 """File name of the trained network in the folder of the run."""
@@ -157,7 +163,18 @@ def main(
                 f"expected {learning.width} (learning.width)"
             )
         learner.warm_start(load_rule_network(checkpoint, grammar))
-    run = TrainingRun(out, training, learner, learning.total_timesteps)
+    run = TrainingRun(
+        out,
+        training,
+        learner,
+        learning.total_timesteps,
+        steps_field="learning.total_timesteps",
+    )
+    metadata = {
+        "kind": CHECKPOINT_KIND,
+        "network": rule_network_metadata(grammar, learning.width),
+        "temperature": training.sampling_temperature or learning.temperature,
+    }
 
     def evaluate() -> tuple[Metrics, Metrics]:
         episodes = sample_episodes(
@@ -175,17 +192,12 @@ def main(
         run,
         learner,
         learning.total_timesteps,
+        CheckpointSpec(CHECKPOINT, metadata, lambda metrics: metrics["score"]),
         train_iteration=learner.train_iteration,
         evaluate=evaluate,
         evaluate_every=training.evaluate_every,
         save_every=training.save_every,
     )
-    metadata = {
-        "kind": CHECKPOINT_KIND,
-        "network": rule_network_metadata(grammar, learning.width),
-        "temperature": training.sampling_temperature or learning.temperature,
-    }
-    run.finish(CHECKPOINT, learner.network, metadata)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 """Training loop and common options of the scripts that train networks."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -22,17 +23,40 @@ Metrics = Mapping[str, float]
 """Values of an evaluation by name."""
 
 
+@dataclass(frozen=True)
+class CheckpointSpec:
+    """Checkpoints that a training writes.
+
+    Attributes:
+        file: File name of the checkpoint of the last step. That of the best evaluation has the
+            same name with `_best`.
+        metadata: Metadata of both.
+        score: Score of an evaluation; the largest is the best.
+    """
+
+    file: str
+    metadata: Mapping[str, Any]
+    score: Callable[[Metrics], float]
+
+    @property
+    def best_file(self) -> str:
+        """File name of the checkpoint of the best evaluation."""
+        path = Path(self.file)
+        return f"{path.stem}_best{path.suffix}"
+
+
 def train_to_end(
     run: TrainingRun,
     learner: Learner,
     total_steps: int,
+    checkpoint: CheckpointSpec,
     *,
     train_iteration: Callable[[], object],
     evaluate: Callable[[], tuple[Metrics, Metrics]],
     evaluate_every: int,
     save_every: int,
 ) -> None:
-    """Train, evaluate and save until the learner has made all steps.
+    """Train, evaluate and save until the learner has made all steps; write the checkpoints.
 
     A run that was interrupted, at any moment, is resumed from its last saved state, and ends with
     the same weights as an uninterrupted one.
@@ -41,6 +65,7 @@ def train_to_end(
         run: The run, which may have been resumed.
         learner: What `train_iteration` trains. It counts its own steps.
         total_steps: Number of steps after which the training ends.
+        checkpoint: The checkpoints.
         train_iteration: Trains for one or more steps.
         evaluate: Returns metrics of the network, and losses.
         evaluate_every: Steps between two evaluations. The last step is always evaluated.
@@ -50,8 +75,13 @@ def train_to_end(
         before = learner.step
         train_iteration()
         run.check_convergence()
+        run.report_progress()
         is_last = learner.step >= total_steps
         if is_last or learner.step // evaluate_every > before // evaluate_every:
             run.report(*evaluate())
+            scores = [checkpoint.score(row) for row in run.history]
+            if scores[-1] == max(scores):
+                run.save_checkpoint(checkpoint.best_file, learner.network, checkpoint.metadata)
         if is_last or learner.step // save_every > before // save_every:
             run.save()
+    run.finish(checkpoint.file, learner.network, checkpoint.metadata)

@@ -31,10 +31,11 @@ from drake_clutter.validation import (
     NonEmptyText,
     NonNegative,
     config_yaml,
+    override_config,
     to_plain,
     validate,
 )
-from drake_clutter.yaml_io import read_yaml
+from drake_clutter.yaml_io import parse_yaml, read_yaml
 
 CONFIG_FILE = "config.yaml"
 """Configuration of the run, and hashes of its input files as comments."""
@@ -44,6 +45,8 @@ HISTORY_FILE = "history.json"
 """One row for each evaluation."""
 TENSORBOARD_FOLDER = "tensorboard"
 """Curves of all evaluations."""
+PROGRESS_PERIOD = 30.0
+"""Time between two printed lines of progress [s]."""
 
 
 class Learner(Protocol):
@@ -80,8 +83,12 @@ class TrainingRun:
         learner: Learner,
         total_steps: int,
         input_files: Sequence[Path] = (),
+        *,
+        steps_field: str = "",
     ) -> None:
         """Start a run, or resume the one in the folder.
+
+        A run is extended if only the number of steps is larger than that of the run in the folder.
 
         Args:
             folder: The run's folder.
@@ -89,6 +96,8 @@ class TrainingRun:
             learner: The learner in its initial state.
             total_steps: Step at which the run ends.
             input_files: Files that the run learns from; they must be unchanged when it is resumed.
+            steps_field: Field of the configuration that holds `total_steps`, such as
+                "learning.total_timesteps"; "" for a run that cannot be extended.
 
         Raises:
             InputError: The folder holds other files, or a run with another configuration or other
@@ -98,6 +107,7 @@ class TrainingRun:
         self._config = config
         self._learner = learner
         self._total_steps = total_steps
+        self._steps_field = steps_field
         self._input_hashes = {str(file): file_sha256(file) for file in input_files}
         text = config_yaml(config) + "".join(
             f"# {file}: sha256 {digest}\n" for file, digest in self._input_hashes.items()
@@ -112,6 +122,12 @@ class TrainingRun:
         self._seconds_before = self.history[-1]["seconds"] if self.history else 0.0
         self._start_time = time.monotonic()
         self._start_step = learner.step
+        self._last_print = self._start_time
+        self._has_printed = False
+        self._console.print(
+            f"{learner.step:>7} of {total_steps} steps: {'resumed' if learner.step else 'started'}",
+            highlight=False,
+        )
 
     def _open(self, text: str) -> None:
         """Write the configuration to a new folder, or restore the run that the folder holds.
@@ -123,7 +139,10 @@ class TrainingRun:
         if not (folder / CONFIG_FILE).exists():
             check_folder_is_empty(folder)
             write_text(folder / CONFIG_FILE, text)
-        elif _with_current_names(folder / CONFIG_FILE, type(self._config)) != text:
+        elif (stored := _with_current_names(folder / CONFIG_FILE, type(self._config))) != text:
+            if self._is_extended(stored):
+                write_text(folder / CONFIG_FILE, text)
+                return self._open(text)
             raise InputError(
                 f"--out {folder}: holds a run of another config or other files, see {CONFIG_FILE}; "
                 "give the same ones or another folder"
@@ -132,6 +151,52 @@ class TrainingRun:
             _load_state(self._learner, folder / STATE_FILE)
             rows = _read_history(folder / HISTORY_FILE)
             self.history = [row for row in rows if row["step"] <= self._learner.step]
+
+    def _is_extended(self, stored: str) -> bool:
+        """Return whether a run has the same configuration, but for a smaller number of steps.
+
+        Args:
+            stored: Content of its `CONFIG_FILE`, with the current names of fields.
+        """
+        names = self._steps_field.split(".")
+        steps: Any = parse_yaml(stored, CONFIG_FILE) if self._steps_field and stored else None
+        for name in names:
+            steps = steps.get(name) if isinstance(steps, dict) else None
+        if not isinstance(steps, int) or steps >= self._total_steps:
+            return False
+        override: Any = steps
+        for name in reversed(names):
+            override = {name: override}
+        earlier = override_config(self._config, override, CONFIG_FILE)
+        hashes = "".join(f"# {file}: sha256 {h}\n" for file, h in self._input_hashes.items())
+        return config_yaml(earlier) + hashes == stored
+
+    @property
+    def _rate(self) -> float:
+        """Steps per second since the run was started or resumed; 0 before the first."""
+        steps = self._learner.step - self._start_step
+        return steps / (time.monotonic() - self._start_time) if steps else 0.0
+
+    @property
+    def _speed_text(self) -> str:
+        """Speed and time left."""
+        # The last iteration may pass the number of steps.
+        remaining_steps = max(0, self._total_steps - self._learner.step)
+        rate = self._rate
+        left = f"{remaining_steps / rate / 60:.0f} min left" if rate else "time left unknown"
+        return f"{rate:.3g} steps/s, {left}"
+
+    def report_progress(self) -> None:
+        """Print steps, speed and time left, after the first iteration and then now and again."""
+        now = time.monotonic()
+        if self._has_printed and now - self._last_print < PROGRESS_PERIOD:
+            return
+        self._has_printed = True
+        self._last_print = now
+        self._console.print(
+            f"{self._learner.step:>7} of {self._total_steps} steps: {self._speed_text}",
+            highlight=False,
+        )
 
     def report(self, charts: Mapping[str, float], losses: Mapping[str, float]) -> None:
         """Record an evaluation in the history, as curves and on the screen.
@@ -147,11 +212,9 @@ class TrainingRun:
             if not math.isfinite(value):
                 raise self._divergence_error(name)
         step = self._learner.step
-        elapsed = time.monotonic() - self._start_time
-        rate = (step - self._start_step) / elapsed if step > self._start_step else 0.0
         row = {
             "step": step,
-            "seconds": self._seconds_before + elapsed,
+            "seconds": self._seconds_before + time.monotonic() - self._start_time,
             "commit": git_commit(),
             **losses,
             **charts,
@@ -159,18 +222,14 @@ class TrainingRun:
         self.history.append(row)
         write_json(self._folder / HISTORY_FILE, self.history)
         for group, values in (
-            ("charts", {**charts, "steps_per_second": rate}),
+            ("charts", {**charts, "steps_per_second": self._rate}),
             ("losses", losses),
         ):
             for name, value in values.items():
                 self._writer.add_scalar(f"{group}/{name}", value, step)
-        # The last iteration may pass the number of steps.
-        remaining_steps = max(0, self._total_steps - step)
-        minutes_left = remaining_steps / rate / 60 if rate else float("nan")
         metrics = ", ".join(f"{name} {value:.3g}" for name, value in {**charts, **losses}.items())
         self._console.print(
-            f"{step:>7} of {self._total_steps}: {metrics}; {rate:.0f} steps/s, "
-            f"{minutes_left:.0f} min left",
+            f"{step:>7} of {self._total_steps}: {metrics}; {self._speed_text}",
             highlight=False,
             soft_wrap=True,
         )
@@ -202,6 +261,18 @@ class TrainingRun:
         """Write the checkpoint and the learner's state, and let others write to the folder.
 
         Args:
+            name: See `save_checkpoint`.
+            network: See `save_checkpoint`.
+            metadata: See `save_checkpoint`.
+        """
+        self.save_checkpoint(name, network, metadata)
+        self.save()
+        self._lock.close()
+
+    def save_checkpoint(self, name: str, network: nn.Module, metadata: Mapping[str, Any]) -> None:
+        """Write a checkpoint of the latest evaluation.
+
+        Args:
             name: File name of the checkpoint.
             network: The trained network.
             metadata: Metadata of the checkpoint. Configuration, hashes of the input files, metrics
@@ -218,8 +289,6 @@ class TrainingRun:
                 "commits": list(dict.fromkeys(row["commit"] for row in self.history)),
             },
         )
-        self.save()
-        self._lock.close()
 
 
 class _HistoryRow(BaseModel):
