@@ -196,7 +196,7 @@ def main(
             "seed": seed,
             "episodes_per_worker": episodes,
             "rate_hz": plain.rate,
-            "camera": {"name": CAMERA, "width": 640, "height": 480, "rate_hz": 10},
+            "recorded_camera": {"name": CAMERA, "width": 640, "height": 480, "rate_hz": 10},
             "model_moves": MODEL_MOVES,
             "shares": shares,
             "rows": rows,

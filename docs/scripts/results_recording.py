@@ -10,7 +10,7 @@ IMAGES = {"none": "none", "RGB-D": "color and depth"}
 def page() -> str:
     """Return the page."""
     results = read_benchmark_results("recording_throughput.json")
-    camera = results["camera"]
+    camera = results["recorded_camera"]
     size = f"{camera['width']} x {camera['height']}"
     text = (
         "# Recording\n\nHow fast `drake-clutter record` makes data sets "
