@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from drake_clutter.catalog import ObjectClass
+from drake_clutter.compilation import njit
 from drake_clutter.planning.tool_kinematics import departure_axis
 from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.validation import NonNegative, config_class
@@ -26,6 +27,8 @@ Floats = NDArray[np.float64]
 _CORNER_SIGNS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 _MAX_SIDESTEP = 0.01
 """Overlap seen from above up to which a violated clearance is one beside the column [m]."""
+_MIN_SIDE_LENGTH = 0.5
+"""Horizontal length of an axis of a box above which the sides across it separate [unit vector]."""
 _TOLERANCE = 1e-4
 """Largest violation of a column's clearance [m]: joint positions of endpoints are not exact."""
 
@@ -99,7 +102,8 @@ class CarriedBox:
         """
         X_TO = X_TG @ X_OG.inverse().GetAsMatrix4()
         corners = box_corners(object_class) @ X_TO[:, :3, :3].swapaxes(1, 2) + X_TO[:, None, :3, 3]
-        return CarriedBox(corners, X_TO[:, :2, :3].swapaxes(1, 2), X_TG[:, :3, 3])
+        axes = np.ascontiguousarray(X_TO[:, :2, :3].swapaxes(1, 2))
+        return CarriedBox(corners, axes, np.ascontiguousarray(X_TG[:, :3, 3]))
 
 
 @dataclass(frozen=True)
@@ -175,11 +179,11 @@ class Column:
             The column, or None if the object is placed where the column would be: what stands below
             is narrower, and known.
         """
-        (room,), (normal,), _ = self._separate(box)
+        room, normal = self._separate(box)
         if room >= 0:
             # The reach of a wider base grows in both axes where the normal is oblique to them.
             growth = float(np.abs(self.axes @ normal).sum())
-            return replace(self, half_size=self.half_size + min(margin, float(room) / growth))
+            return replace(self, half_size=self.half_size + min(margin, room / growth))
         if box.corners[0, :, 2].min() < self.top - _TOLERANCE:
             return None
         return replace(self, anchors=np.array([self.anchors[0], anchor]))
@@ -194,47 +198,126 @@ class Column:
             clearance: Required clearance above the column [m].
             max_drift: Distance from the axis at which it is required in full; 0: everywhere [m].
         """
-        required = np.full(len(box.p_TG), clearance)
-        if max_drift:
-            drifts = [
-                np.linalg.norm(np.cross(box.p_TG - p_TG, axis), axis=1)
-                for p_TG, axis in self.anchors
-            ]
-            required *= np.minimum(np.min(drifts, axis=0) / max_drift, 1.0)
-        above = box.corners[:, :, 2].min(axis=1) - self.top - required
-        lowest = box.corners[:, :, 2].argmin(axis=1)
-        beside, normals, nearest = self._separate(box)
-        is_above = (above >= beside) | (beside < -_MAX_SIDESTEP)
-        directions = np.zeros((len(above), 3))
-        directions[:, :2] = normals
-        directions[is_above] = (0.0, 0.0, 1.0)
-        index = np.where(is_above, lowest, nearest)
-        points = np.take_along_axis(box.corners, index[:, None, None], axis=1)[:, 0]
-        return ColumnSlack(np.where(is_above, above, beside), directions, points)
+        m = len(box.p_TG)
+        slack = ColumnSlack(np.empty(m), np.zeros((m, 3)), np.empty((m, 3)))
+        _calc_slack(
+            box.corners,
+            box.axes,
+            box.p_TG,
+            self.center,
+            self.axes,
+            self.half_size,
+            self.top,
+            self.anchors,
+            clearance,
+            max_drift,
+            slack.values,
+            slack.directions,
+            slack.points,
+        )
+        return slack
 
-    def _separate(self, box: CarriedBox) -> tuple[Floats, Floats, NDArray[np.int64]]:
-        """Return the largest separation of the column and a box seen from above.
+    def _separate(self, box: CarriedBox) -> tuple[float, Floats]:
+        """Return the largest separation of the column and a box seen from above, see `_separate`.
 
-        The separation along the normal of any side is a lower bound of the distance.
+        Args:
+            box: Box at one configuration.
 
         Returns:
-            Separations [m], shape (m,); normals, shape (m, 2), away from the column; and indices of
-            the corners of the box that are nearest, shape (m,).
+            Separation [m] and normal, shape (2,), away from the column.
         """
-        m = len(box.corners)
-        lengths = np.linalg.norm(box.axes, axis=2)
-        sides = np.where(
-            (lengths > 0.5)[..., None], box.axes / np.maximum(lengths, 0.5)[..., None], 0.0
+        separation, x, y, _ = _separate(
+            box.corners[0], box.axes[0], self.center, self.axes, self.half_size
         )
-        normals = np.concatenate([np.broadcast_to(self.axes, (m, 2, 2)), sides], axis=1)
-        normals = np.concatenate([normals, -normals], axis=1)
-        reach = np.abs(normals @ self.axes.T) @ self.half_size + normals @ self.center
-        projections = normals @ box.corners[:, :, :2].swapaxes(1, 2)
-        separations = projections.min(axis=2) - reach
-        separations[~normals.any(axis=2)] = -np.inf
-        best = separations.argmax(axis=1)
-        rows = np.arange(m)
-        return separations[rows, best], normals[rows, best], projections[rows, best].argmin(axis=1)
+        return separation, np.array([x, y])
+
+
+@njit(cache=True, nogil=True)
+def _separate(corners, axes, center, column_axes, half_size):  # type: ignore[no-untyped-def]
+    """Return the largest separation of a column and a box seen from above.
+
+    The separation along the normal of any side is a lower bound of the distance.
+
+    Args:
+        corners: Corners of the box. Shape (8, 3).
+        axes: Horizontal parts of its axes. Shape (3, 2).
+        center: Center of the column. Shape (2,).
+        column_axes: Axes of the column. Shape (2, 2).
+        half_size: Half the extents of the column. Shape (2,).
+
+    Returns:
+        Separation [m], x and y of the normal away from the column, index of the nearest corner.
+    """
+    best, best_x, best_y, nearest = -np.inf, 0.0, 0.0, 0
+    for sign in (1.0, -1.0):
+        for side in range(5):
+            if side < 2:
+                x, y = column_axes[side, 0], column_axes[side, 1]
+            else:
+                x, y = axes[side - 2, 0], axes[side - 2, 1]
+                length = math.sqrt(x * x + y * y)
+                if length <= _MIN_SIDE_LENGTH:
+                    continue
+                x, y = x / length, y / length
+            x, y = sign * x, sign * y
+            reach = x * center[0] + y * center[1]
+            for k in range(2):
+                along = x * column_axes[k, 0] + y * column_axes[k, 1]
+                reach += abs(along) * half_size[k]
+            lowest, corner = np.inf, 0
+            for k in range(len(corners)):
+                projection = x * corners[k, 0] + y * corners[k, 1]
+                if projection < lowest:
+                    lowest, corner = projection, k
+            if lowest - reach > best:
+                best, best_x, best_y, nearest = lowest - reach, x, y, corner
+    return best, best_x, best_y, nearest
+
+
+@njit(cache=True, nogil=True)
+def _calc_slack(  # type: ignore[no-untyped-def]
+    corners,
+    axes,
+    p_TG,
+    center,
+    column_axes,
+    half_size,
+    top,
+    anchors,
+    clearance,
+    max_drift,
+    values,
+    directions,
+    points,
+):
+    """Write values (m,), directions (m, 3) and points (m, 3) of `Column.slack`."""
+    for row in range(len(corners)):
+        required = clearance
+        if max_drift > 0:
+            drift = np.inf
+            for anchor in range(len(anchors)):
+                rx = p_TG[row, 0] - anchors[anchor, 0, 0]
+                ry = p_TG[row, 1] - anchors[anchor, 0, 1]
+                rz = p_TG[row, 2] - anchors[anchor, 0, 2]
+                ax, ay, az = anchors[anchor, 1]
+                x, y, z = ry * az - rz * ay, rz * ax - rx * az, rx * ay - ry * ax
+                drift = min(drift, math.sqrt(x * x + y * y + z * z))
+            required *= min(drift / max_drift, 1.0)
+        lowest = 0
+        for k in range(len(corners[row])):
+            if corners[row, k, 2] < corners[row, lowest, 2]:
+                lowest = k
+        above = corners[row, lowest, 2] - top - required
+        beside, x, y, nearest = _separate(corners[row], axes[row], center, column_axes, half_size)
+        if above >= beside or beside < -_MAX_SIDESTEP:
+            values[row] = above
+            directions[row, 2] = 1.0
+            nearest = lowest
+        else:
+            values[row] = beside
+            directions[row, 0], directions[row, 1] = x, y
+        for i in range(3):
+            points[row, i] = corners[row, nearest, i]
 
 
 def columns_below(

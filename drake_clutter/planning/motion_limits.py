@@ -117,7 +117,8 @@ class MotionLimits:
         self._tilted_load = TiltedLoad(cell, payload, tilted_tool) if tilted_tool else None
         n = self.robot.num_joints
         widths = {LimitKind.LOAD: 1, LimitKind.TOOL_SPEED: len(tools)}
-        self._widths = [widths.get(kind, n) for kind in LimitKind]
+        counts = [widths.get(kind, n) for kind in LimitKind]
+        self._kinds: NDArray[np.object_] = np.repeat([*LimitKind], counts)
 
     def ratios(self, motion: MotionSamples) -> "LimitRatios":
         """Return the ratios of a motion to its limits.
@@ -127,7 +128,7 @@ class MotionLimits:
         """
         robot = self.robot
         moved = self.dynamics.motion(motion.q, motion.v, motion.a, self.p_FC)
-        values = np.empty((len(motion.q), sum(self._widths)))
+        values = np.empty((len(motion.q), len(self._kinds)))
         _calc_ratios(
             motion.q,
             motion.v,
@@ -146,13 +147,12 @@ class MotionLimits:
             self.max_tool_speed,
             values,
         )
-        kinds = np.repeat([*LimitKind], self._widths)
         if self._tilted_load is not None:
             R_BF = robot.forward_kinematics(motion.q)[:, :3, :3]
             ratios = self._tilted_load.ratios(R_BF, moved.accelerations[:, 0])
-            column = int(np.flatnonzero(kinds == LimitKind.LOAD)[0])
+            column = int(np.flatnonzero(self._kinds == LimitKind.LOAD)[0])
             values[:, column] = np.maximum(values[:, column], ratios)
-        return LimitRatios(values, kinds)
+        return LimitRatios(values, self._kinds)
 
     def find_violation(self, ratios: "LimitRatios") -> LimitViolation | None:
         """Return the limit that is exceeded most by more than `LIMIT_TOLERANCE`, if any."""

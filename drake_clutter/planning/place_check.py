@@ -14,6 +14,7 @@ from scipy.spatial import ConvexHull
 
 from drake_clutter.catalog import ObjectClass, Shape
 from drake_clutter.cell.lip_seal import piece_half_spaces
+from drake_clutter.compilation import njit
 from drake_clutter.planning.collision_model import CollisionModel, SignedDistance
 from drake_clutter.planning.pick_place_plan import PlanningFailure, PlanningFailureReason
 from drake_clutter.scenes.scene import SceneObject
@@ -35,6 +36,8 @@ CONTACT_BAND = 0.002
 _BALANCE_TOLERANCE = 0.001
 """Distance by which a center of mass may lie outside of the points that carry the object [m]; the
 points are samples."""
+_LINE_WIDTH = 1e-6
+"""Points whose root sum of squared distances from a line is smaller lie on it [m]."""
 _NUM_SAMPLES = (11, 61)
 """Samples of the underside along each axis, in addition to the edges of what is below. A pose that
 fails with few samples is checked with more."""
@@ -215,11 +218,45 @@ def _overhang(points: Floats, p: Floats) -> float:
         points: Points [m]. Shape (m, 2), m > 0.
         p: The point [m]. Shape (2,).
     """
+    ordered = points[np.lexsort((points[:, 1], points[:, 0]))]
     spread = points - points.mean(axis=0)
-    if len(points) < 3 or np.linalg.svd(spread, compute_uv=False)[1] < 1e-6:
+    xx, xy, yy = (float(spread[:, i] @ spread[:, j]) for i, j in ((0, 0), (0, 1), (1, 1)))
+    least_variance = (xx + yy) / 2 - math.hypot((xx - yy) / 2, xy)
+    if len(points) < 3 or least_variance < _LINE_WIDTH**2:
         direction = np.linalg.svd(spread)[2][0]
         along = spread @ direction
         offset = p - points.mean(axis=0)
         nearest = np.clip(offset @ direction, along.min(), along.max()) * direction
         return float(np.linalg.norm(offset - nearest))
-    return max(0.0, float((ConvexHull(points).equations @ [*p, 1.0]).max()))
+    return max(0.0, float(_distance_outside(ordered, p)))
+
+
+@njit(cache=True, nogil=True)
+def _distance_outside(points, p):  # type: ignore[no-untyped-def]
+    """Return the largest distance of a point outside of a side of the hull of others [m].
+
+    The hull is found by Andrew's monotone chain.
+
+    Args:
+        points: Points in the order of x, then of y [m]. Shape (m, 2).
+        p: The point [m]. Shape (2,).
+    """
+    largest = -np.inf
+    chain = np.empty((len(points), 2))
+    for direction in (1, -1):
+        count = 0
+        for k in range(len(points)):
+            x, y = points[k if direction > 0 else len(points) - 1 - k]
+            while count > 1:
+                ax, ay = chain[count - 2]
+                bx, by = chain[count - 1]
+                if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0:
+                    break
+                count -= 1
+            chain[count, 0], chain[count, 1] = x, y
+            count += 1
+        for k in range(count - 1):
+            dx, dy = chain[k + 1, 0] - chain[k, 0], chain[k + 1, 1] - chain[k, 1]
+            outside = dy * (p[0] - chain[k, 0]) - dx * (p[1] - chain[k, 1])
+            largest = max(largest, outside / math.sqrt(dx * dx + dy * dy))
+    return largest

@@ -52,6 +52,49 @@ _MAX_SQUARED_SPEED = 1e6
 """
 
 
+def _gradient_weights(grid: Floats) -> Floats:
+    """Return the weights of three neighboring values in derivatives of second order.
+
+    They are those of `numpy.gradient`; the outermost derivatives are one-sided.
+
+    Args:
+        grid: Parameters. Shape (m,).
+
+    Returns:
+        Weights. Shape (m, 3).
+    """
+    before, after = np.diff(grid)[:-1], np.diff(grid)[1:]
+    both = before + after
+    inner = [-after / (before * both), (after - before) / (before * after), before / (after * both)]
+    a, b = before[0], after[0]
+    first = [-(2 * a + b) / (a * (a + b)), (a + b) / (a * b), -a / (b * (a + b))]
+    a, b = before[-1], after[-1]
+    last = [b / (a * (a + b)), -(b + a) / (a * b), (2 * b + a) / (b * (a + b))]
+    return np.vstack([first, np.column_stack(inner), last])
+
+
+_GRID = np.linspace(0.0, 1.0, _NUM_GRID_POINTS)
+"""Parameters of a path at which limits are imposed. Shape (_NUM_GRID_POINTS,)."""
+_GRADIENT_WEIGHTS = _gradient_weights(_GRID)
+"""See `_gradient_weights`. Shape (_NUM_GRID_POINTS, 3)."""
+
+
+@njit(cache=True, nogil=True)
+def _differentiate(weights, values):  # type: ignore[no-untyped-def]
+    """Return derivatives (m, k) of values (m, k), see `_gradient_weights`."""
+    m, k = values.shape
+    derivatives = np.empty((m, k))
+    for i in range(m):
+        first = min(max(i - 1, 0), m - 3)
+        for j in range(k):
+            derivatives[i, j] = (
+                weights[i, 0] * values[first, j]
+                + weights[i, 1] * values[first + 1, j]
+                + weights[i, 2] * values[first + 2, j]
+            )
+    return derivatives
+
+
 def min_travel_time(displacements: Floats, robot: RobotModel) -> Floats:
     """Return the minimum time of joint displacements from rest to rest [s].
 
@@ -220,15 +263,15 @@ def path_speed_problem(path: CubicSpline, limits: MotionLimits) -> PathSpeedProb
         limits: Limits of the motion.
     """
     robot = limits.robot
-    grid = np.linspace(0.0, 1.0, _NUM_GRID_POINTS)
+    grid = _GRID
     on_path = path.sample(grid)
     q, dq_ds, d2q_ds2 = on_path.q, on_path.v, on_path.a
     X_BF = robot.forward_kinematics(q)
     rows = [(dq_ds, d2q_ds2, robot.acceleration_limits)]
     if math.isfinite(limits.payload.max_acceleration):
         p_BCm = X_BF[:, :3, :3] @ limits.p_FC[0] + X_BF[:, :3, 3]
-        dp_ds = np.gradient(p_BCm, grid, axis=0, edge_order=2)
-        d2p_ds2 = np.gradient(dp_ds, grid, axis=0, edge_order=2)
+        dp_ds = _differentiate(_GRADIENT_WEIGHTS, p_BCm)
+        d2p_ds2 = _differentiate(_GRADIENT_WEIGHTS, dp_ds)
         rows.append((dp_ds, d2p_ds2, np.full(3, limits.payload.max_axis_acceleration)))
     a, b, bounds = (
         np.hstack([np.broadcast_to(row[k], row[0].shape) for row in rows]) for k in range(3)

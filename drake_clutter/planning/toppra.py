@@ -111,7 +111,10 @@ def _solve_toppra(step, a, a_next, b, lower, upper, max_squared_speeds, x):  # t
             )
             if u_min <= u_max or min_slope <= max_slope:
                 break
-            at = max(at - (u_min - u_max) / (min_slope - max_slope), 0.0)
+            crossing = max(at - (u_min - u_max) / (min_slope - max_slope), 0.0)
+            if crossing == at:
+                break
+            at = crossing
         controllable[i] = at
     # Forward pass: the largest feasible acceleration at each point.
     unbounded = -np.inf, np.inf, 0.0, 0.0

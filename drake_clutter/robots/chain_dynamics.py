@@ -99,21 +99,54 @@ class ChainDynamics:
 
 
 @njit(cache=True, inline="always")
-def _cross(a, b, out):  # type: ignore[no-untyped-def]
-    """Write the cross product of vectors a and b (3,) to out."""
-    out[0] = a[1] * b[2] - a[2] * b[1]
-    out[1] = a[2] * b[0] - a[0] * b[2]
-    out[2] = a[0] * b[1] - a[1] * b[0]
+def _cross(a, b):  # type: ignore[no-untyped-def]
+    """Return the cross product of two vectors."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @njit(cache=True, inline="always")
-def _relative_motion(w, alpha, r, velocity, acceleration, scratch):  # type: ignore[no-untyped-def]
-    """Write velocity and acceleration of a point at r relative to the origin of its body."""
-    _cross(w, r, velocity)
-    _cross(alpha, r, acceleration)
-    _cross(w, velocity, scratch)
-    for i in range(3):
-        acceleration[i] += scratch[i]
+def _add(a, b):  # type: ignore[no-untyped-def]
+    """Return the sum of two vectors."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@njit(cache=True, inline="always")
+def _subtract(a, b):  # type: ignore[no-untyped-def]
+    """Return the difference of two vectors."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@njit(cache=True, inline="always")
+def _scale(factor, a):  # type: ignore[no-untyped-def]
+    """Return a vector times a factor."""
+    return factor * a[0], factor * a[1], factor * a[2]
+
+
+@njit(cache=True, inline="always")
+def _add_rotated(first, R, a):  # type: ignore[no-untyped-def]
+    """Return first + R a, of the left three columns of R."""
+    return (
+        first[0] + R[0, 0] * a[0] + R[0, 1] * a[1] + R[0, 2] * a[2],
+        first[1] + R[1, 0] * a[0] + R[1, 1] * a[1] + R[1, 2] * a[2],
+        first[2] + R[2, 0] * a[0] + R[2, 1] * a[1] + R[2, 2] * a[2],
+    )
+
+
+@njit(cache=True, inline="always")
+def _rotate_back(R, a):  # type: ignore[no-untyped-def]
+    """Return R^T a, of the left three columns of R."""
+    return (
+        R[0, 0] * a[0] + R[1, 0] * a[1] + R[2, 0] * a[2],
+        R[0, 1] * a[0] + R[1, 1] * a[1] + R[2, 1] * a[2],
+        R[0, 2] * a[0] + R[1, 2] * a[1] + R[2, 2] * a[2],
+    )
+
+
+@njit(cache=True, inline="always")
+def _relative_motion(w, alpha, r):  # type: ignore[no-untyped-def]
+    """Return velocity and acceleration of a point at r relative to the origin of its body."""
+    velocity = _cross(w, r)
+    return velocity, _add(_cross(alpha, r), _cross(w, velocity))
 
 
 @njit(cache=True, nogil=True)
@@ -133,81 +166,70 @@ def _calc_motion(  # type: ignore[no-untyped-def]
     velocities,
     accelerations,
 ):
-    """Write torques (m, n), and velocities and accelerations (m, k, 3) of points p_FC (k, 3)."""
+    """Write torques (m, n), and velocities and accelerations (m, k, 3) of points p_FC (k, 3).
+
+    Vectors are tuples, which the compiler keeps in registers.
+    """
     n = len(revolute)
     frames, moved = np.empty((n + 1, 4, 4)), np.empty((n, 3, 4))
-    origin = np.zeros((n + 1, 3))  # of each joint's frame; row n + 1 is that of the base
-    force = np.empty((n, 3))
-    moment = np.empty((n, 3))  # about the origin of the joint
-    lever = np.empty((n, 3))  # mass times its lever about the origin of the joint
-    w, alpha, v_o, a_o = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
-    r, dv, da, scratch, spin = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    w_J, alpha_J, h_J = np.empty(3), np.empty(3), np.empty(3)
+    forces = np.empty((n, 3))
+    moments = np.empty((n, 3))  # about the origin of the joint
+    levers = np.empty((n, 3))  # mass times its lever about the origin of the joint
+    zero = 0.0, 0.0, 0.0
+    g = gravity[0], gravity[1], gravity[2]
     for k in range(len(q)):
         chain_frames(fixed, revolute, q[k], frames, moved)
-        for i in range(3):
-            w[i] = alpha[i] = v_o[i] = a_o[i] = 0.0
+        w = alpha = v_o = a_o = origin = zero
         for j in range(n):
-            rotation = moved[j]
-            z = rotation[:, 2]
+            R = moved[j]
+            z = R[0, 2], R[1, 2], R[2, 2]
+            p = R[0, 3], R[1, 3], R[2, 3]
+            dv, da = _relative_motion(w, alpha, _subtract(p, origin))
+            origin = p
+            spin = _cross(w, z)
+            v_o, a_o = _add(v_o, dv), _add(a_o, da)
+            if revolute[j]:
+                alpha = _add(alpha, _add(_scale(v[k, j], spin), _scale(a[k, j], z)))
+                w = _add(w, _scale(v[k, j], z))
+            else:
+                a_o = _add(a_o, _add(_scale(2 * v[k, j], spin), _scale(a[k, j], z)))
+                v_o = _add(v_o, _scale(v[k, j], z))
+            r = _add_rotated(zero, R, (p_JCm[j, 0], p_JCm[j, 1], p_JCm[j, 2]))
+            _, da = _relative_motion(w, alpha, r)
+            force = _scale(masses[j], _add(a_o, da))
+            w_J, alpha_J = _rotate_back(R, w), _rotate_back(R, alpha)
+            # Moment of inertia in J: its gyroscopic part and that of the angular acceleration.
+            h_J = _add_rotated(zero, inertias[j], w_J)
+            spin = _add_rotated(_cross(w_J, h_J), inertias[j], alpha_J)
+            moment = _add_rotated(_cross(r, force), R, spin)
             for i in range(3):
-                origin[j, i] = rotation[i, 3]
-                r[i] = origin[j, i] - origin[j - 1, i]
-            _relative_motion(w, alpha, r, dv, da, scratch)
-            _cross(w, z, spin)
-            for i in range(3):
-                v_o[i] += dv[i]
-                a_o[i] += da[i]
-                if revolute[j]:
-                    alpha[i] += spin[i] * v[k, j] + z[i] * a[k, j]
-                    w[i] += z[i] * v[k, j]
-                else:
-                    a_o[i] += 2 * spin[i] * v[k, j] + z[i] * a[k, j]
-                    v_o[i] += z[i] * v[k, j]
-            for i in range(3):
-                r[i] = w_J[i] = alpha_J[i] = 0.0
-                for x in range(3):
-                    r[i] += rotation[i, x] * p_JCm[j, x]
-                    w_J[i] += rotation[x, i] * w[x]
-                    alpha_J[i] += rotation[x, i] * alpha[x]
-            _relative_motion(w, alpha, r, dv, da, scratch)
-            for i in range(3):
-                force[j, i] = masses[j] * (a_o[i] + da[i])
-                lever[j, i] = masses[j] * r[i]
-                h_J[i] = 0.0
-                for x in range(3):
-                    h_J[i] += inertias[j, i, x] * w_J[x]
-            _cross(w_J, h_J, spin)  # moment of inertia in J, first its gyroscopic part
-            for i in range(3):
-                for x in range(3):
-                    spin[i] += inertias[j, i, x] * alpha_J[x]
-            _cross(r, force[j], moment[j])
-            for i in range(3):
-                for x in range(3):
-                    moment[j, i] += rotation[i, x] * spin[x]
+                forces[j, i] = force[i]
+                moments[j, i] = moment[i]
+                levers[j, i] = masses[j] * r[i]
+        X = frames[n]
         for point in range(len(p_FC)):
-            for i in range(3):
-                r[i] = frames[n, i, 3] - origin[n - 1, i]
-                for x in range(3):
-                    r[i] += frames[n, i, x] * p_FC[point, x]
-            _relative_motion(w, alpha, r, dv, da, scratch)
+            p = p_FC[point, 0], p_FC[point, 1], p_FC[point, 2]
+            r = _add_rotated(_subtract((X[0, 3], X[1, 3], X[2, 3]), origin), X, p)
+            dv, da = _relative_motion(w, alpha, r)
             for i in range(3):
                 velocities[k, point, i] = v_o[i] + dv[i]
                 accelerations[k, point, i] = a_o[i] + da[i]
+        force = moment = lever = zero
         mass = 0.0
+        origin = moved[n - 1, 0, 3], moved[n - 1, 1, 3], moved[n - 1, 2, 3]
         for j in range(n - 1, -1, -1):
-            if j < n - 1:
-                for i in range(3):
-                    r[i] = origin[j + 1, i] - origin[j, i]
-                _cross(r, force[j + 1], scratch)
-                for i in range(3):
-                    force[j, i] += force[j + 1, i]
-                    moment[j, i] += moment[j + 1, i] + scratch[i]
-                    lever[j, i] += lever[j + 1, i] + mass * r[i]
+            R = moved[j]
+            p = R[0, 3], R[1, 3], R[2, 3]
+            r = _subtract(origin, p)
+            origin = p
+            own = moments[j, 0], moments[j, 1], moments[j, 2]
+            moment = _add(own, _add(moment, _cross(r, force)))
+            lever = _add((levers[j, 0], levers[j, 1], levers[j, 2]), _add(lever, _scale(mass, r)))
+            force = _add((forces[j, 0], forces[j, 1], forces[j, 2]), force)
             mass += masses[j]
-            _cross(gravity, lever[j], scratch)
-            dynamic[k, j] = gravitational[k, j] = 0.0
-            for i in range(3):
-                z_i = frames[j, i, 2]
-                dynamic[k, j] += z_i * (moment[j, i] if revolute[j] else force[j, i])
-                gravitational[k, j] += z_i * (scratch[i] if revolute[j] else -mass * gravity[i])
+            z = frames[j, 0, 2], frames[j, 1, 2], frames[j, 2, 2]
+            turning = _cross(g, lever)
+            along = moment if revolute[j] else force
+            held = turning if revolute[j] else _scale(-mass, g)
+            dynamic[k, j] = z[0] * along[0] + z[1] * along[1] + z[2] * along[2]
+            gravitational[k, j] = z[0] * held[0] + z[1] * held[1] + z[2] * held[2]

@@ -116,12 +116,11 @@ class UrInverseKinematics:
 
     def track(self, X_BF: Floats, q_start: Floats) -> Floats | None:
         """Return the branch of q_start along poses, see `InverseKinematics`."""
-        q = self.solve(X_BF)[:, branch_index(q_start, self.parameters)]
+        q = np.ascontiguousarray(self.solve(X_BF)[:, branch_index(q_start, self.parameters)])
         if not np.isfinite(q).all():
             return None
         q[0] = q_start
-        for k in range(1, len(q)):
-            q[k] = self.joint_range.unwrap(q[k], q[k - 1])
+        self.joint_range.unwrap_path(q)
         return None if (np.abs(np.diff(q, axis=0)) > MAX_JOINT_JUMP).any() else q
 
     def follow(self, X_BF: Floats, q: Floats) -> Floats | None:

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_clutter.compilation import njit
+
 Floats = NDArray[np.float64]
 
 FULL_TURN = 2 * np.pi
@@ -50,6 +52,14 @@ class JointRange:
         )
         return np.asarray(np.where(self.exceeds_full_turn, nearest, q))
 
+    def unwrap_path(self, path: Floats) -> None:
+        """Replace each row of a path by its equivalent nearest to the row before, see `unwrap`.
+
+        Args:
+            path: Positions within the limits. Shape (m, n).
+        """
+        _unwrap_path(path, self.limits, self.exceeds_full_turn)
+
     def wrap_to_limits(self, q: Floats) -> Floats:
         """Return equivalent positions within the limits.
 
@@ -66,3 +76,18 @@ class JointRange:
         q = np.where((q >= lower) & (q <= upper), q, wrapped)
         inside = ((q >= lower - _ROUNDING) & (q <= upper + _ROUNDING)).all(axis=-1, keepdims=True)
         return np.where(inside, np.clip(q, lower, upper), np.nan)
+
+
+@njit(cache=True, nogil=True)
+def _unwrap_path(path, limits, exceeds_full_turn):  # type: ignore[no-untyped-def]
+    """Unwrap a path (m, n) in place, see `JointRange.unwrap_path`."""
+    for joint in np.flatnonzero(exceeds_full_turn):
+        lower, upper = limits[joint]
+        for k in range(1, len(path)):
+            turns = np.rint((path[k - 1, joint] - path[k, joint]) / FULL_TURN)
+            q = path[k, joint] + FULL_TURN * turns
+            if q > upper:
+                q -= FULL_TURN
+            elif q < lower:
+                q += FULL_TURN
+            path[k, joint] = q
