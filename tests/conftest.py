@@ -9,13 +9,14 @@ import re
 from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import pytest
 from hypothesis import settings
 
-from drake_clutter.catalog import load_catalog
+from drake_clutter.assets import build_assets
+from drake_clutter.catalog import ObjectClass, load_catalog
 from drake_clutter.cell.support import Support
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.config import ClutterConfig, load_config
@@ -42,6 +43,9 @@ from drake_clutter.simulation.drake_judge import DrakeJudge
 from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.validation import load_config_as
 
+if TYPE_CHECKING:
+    import trimesh
+
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 settings.load_profile("repeatable")
 
@@ -54,6 +58,16 @@ GRAMMARS = {name: SceneGrammar(CATALOG.object_set(name)) for name in ("ycb7", "p
 DEFAULT_CELL = default_cell()
 TRAY = DEFAULT_CELL.support
 WORLD = ClutterConfig()
+
+
+def own_mesh_class(folder: Path, mesh: "trimesh.Trimesh") -> ObjectClass:
+    """Return a built class of a mesh of 200 g."""
+    mesh.export(folder / "own.stl")
+    (folder / "catalog.yaml").write_text(
+        "classes:\n  own: {shape: mesh, mesh: own.stl, mass_g: 200}\n"
+    )
+    build_assets(folder)
+    return load_catalog(folder).classes["own"]
 
 
 def resting(

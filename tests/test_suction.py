@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from conftest import CLASSES, DEFAULT_CELL, cell_with, resting
+from conftest import CLASSES, DEFAULT_CELL, cell_with, own_mesh_class, resting
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_clutter.assets import build_assets
-from drake_clutter.catalog import ObjectClass, RestOrientation, Shape, load_catalog
+from drake_clutter.catalog import RestOrientation, Shape, load_catalog
 from drake_clutter.cell.gripper import (
     Grasp,
     GraspFailure,
@@ -311,23 +310,13 @@ def test_a_cup_attaches_where_the_surface_is_flat() -> None:
     assert not SUCTION.can_attach("single", can, on_top(0.0505, x=0.025))
 
 
-def own_class(folder: Path, mesh: trimesh.Trimesh) -> ObjectClass:
-    """Return a built class of a mesh."""
-    mesh.export(folder / "own.stl")
-    (folder / "catalog.yaml").write_text(
-        "classes:\n  own: {shape: mesh, mesh: own.stl, mass_g: 200}\n"
-    )
-    build_assets(folder)
-    return load_catalog(folder).classes["own"]
-
-
 def revolved(outline: list[tuple[float, float]]) -> trimesh.Trimesh:
     """Return a solid of revolution of an outline of radii and heights [m]."""
     return trimesh.creation.revolve(np.array(outline), sections=32)
 
 
 def test_the_profile_of_a_mesh_is_that_of_the_box_of_its_size(tmp_path: Path) -> None:
-    own = own_class(tmp_path, trimesh.creation.box((0.05, 0.06, 0.07)))
+    own = own_mesh_class(tmp_path, trimesh.creation.box((0.05, 0.06, 0.07)))
     assert lip_flatness_deviation(own, on_top(0.035), CUP.diameter) == pytest.approx(0.0, abs=1e-9)
     assert lip_surface_profile(own, on_top(0.045), CUP.diameter) == pytest.approx(
         np.full(24, 0.010), abs=1e-7
@@ -340,7 +329,7 @@ def test_the_profile_of_a_mesh_is_that_of_the_box_of_its_size(tmp_path: Path) ->
 def test_convex_pieces_that_bulge_over_a_flat_lid_do_not_break_the_seal(tmp_path: Path) -> None:
     """A lid that lies below its rim is flat, though a convex piece rises 2 mm above its edge."""
     rim = [(0, 0), (0.04, 0), (0.04, 0.06), (0.038, 0.06), (0.038, 0.057), (0, 0.057)]
-    own = own_class(tmp_path, revolved(rim))
+    own = own_mesh_class(tmp_path, revolved(rim))
     for piece in own.folder.glob("convex_*.obj"):
         piece.unlink()
     bulge = revolved([(0, 0), (0.04, 0), (0.04, 0.06), (0.01, 0.058), (0, 0.057)]).convex_hull
@@ -369,7 +358,7 @@ def test_convex_pieces_that_bulge_over_a_flat_lid_do_not_break_the_seal(tmp_path
 def test_every_grasp_on_a_mesh_is_one_that_the_simulation_attaches(tmp_path: Path) -> None:
     """In a bowl the lip goes down to the floor, 30 mm below the rim."""
     bowl = [(0, 0), (0.06, 0), (0.07, 0.036), (0.066, 0.036), (0.056, 0.006), (0, 0.006)]
-    own = own_class(tmp_path, revolved(bowl))
+    own = own_mesh_class(tmp_path, revolved(bowl))
     X_TO = RigidTransform([0.1, 0.0, 0.018])
     grasps = SUCTION.sample_grasps(own, X_TO, SAMPLING)
     assert not isinstance(grasps, GraspFailure)
@@ -384,7 +373,7 @@ def test_every_grasp_on_a_mesh_is_one_that_the_simulation_attaches(tmp_path: Pat
 def test_a_plate_has_grasps_at_which_the_cup_seals(tmp_path: Path) -> None:
     """Its rim is 9 mm above its floor; the convex pieces stay within the reach of the lip."""
     plate = [(0, 0), (0.055, 0), (0.09, 0.009), (0.09, 0.014), (0.054, 0.005), (0, 0.005)]
-    own = own_class(tmp_path, revolved(plate))
+    own = own_mesh_class(tmp_path, revolved(plate))
     grasps = SUCTION.sample_grasps(own, RigidTransform([0.0, 0.0, 0.007]), SAMPLING)
     assert not isinstance(grasps, GraspFailure)
     assert grasps[0].X_TG.translation()[2] == pytest.approx(0.005, abs=0.0035 + 1e-6)

@@ -32,7 +32,7 @@ _MIN_HORIZONTAL_PART = 1e-6
 """Smallest horizontal part of a unit vector that is not vertical."""
 
 
-def _grid_points(lower: Floats, upper: Floats, target: Floats, spacing: float) -> Floats:
+def grid_points(lower: Floats, upper: Floats, target: Floats, spacing: float) -> Floats:
     """Return grid points of a rectangle, the closest to a target first.
 
     Args:
@@ -65,7 +65,7 @@ def _ring_points(diameter: float) -> Floats:
     return np.asarray(unit * diameter / 2)
 
 
-def _piece_depths(object_class: ObjectClass, X_OG: RigidTransform, points: Floats) -> Floats:
+def piece_depths(object_class: ObjectClass, X_OG: RigidTransform, points: Floats) -> Floats:
     """Return the depth of the convex pieces below points of the lip.
 
     Args:
@@ -94,7 +94,7 @@ def _piece_depths(object_class: ObjectClass, X_OG: RigidTransform, points: Float
 
 
 def _mesh_depths(object_class: ObjectClass, X_OG: RigidTransform, points: Floats) -> Floats:
-    """Return the depth of a mesh below points of the lip, see `_piece_depths`."""
+    """Return the depth of a mesh below points of the lip, see `piece_depths`."""
     triangles = (object_class.surface_triangles - X_OG.translation()) @ X_OG.rotation().matrix()
     near = (triangles[:, :, :2].min(axis=1) <= points[:, :2].max(axis=0)).all(axis=1) & (
         triangles[:, :, :2].max(axis=1) >= points[:, :2].min(axis=0)
@@ -116,7 +116,7 @@ def _mesh_depths(object_class: ObjectClass, X_OG: RigidTransform, points: Floats
 def _contact_depth(object_class: ObjectClass, X_OG: RigidTransform, diameter: float) -> float:
     """Return how far a cup moves along z of G until it touches a convex piece [m]."""
     points = np.vstack([_ring_points(share * diameter) for share in (0.0, 0.5, 1.0)])
-    return float(_piece_depths(object_class, X_OG, points).min())
+    return float(piece_depths(object_class, X_OG, points).min())
 
 
 def lip_surface_profile(object_class: ObjectClass, X_OG: RigidTransform, diameter: float) -> Floats:
@@ -132,7 +132,7 @@ def lip_surface_profile(object_class: ObjectClass, X_OG: RigidTransform, diamete
     Returns:
         Distances along z of G [m]; infinite where no surface is below. Shape (24,).
     """
-    depths = _mesh_depths if object_class.shape is Shape.MESH else _piece_depths
+    depths = _mesh_depths if object_class.shape is Shape.MESH else piece_depths
     return depths(object_class, X_OG, _ring_points(diameter))
 
 
@@ -209,13 +209,13 @@ def face_poses(
         diameter: Diameter of the lip [m].
         spacing: Distance of neighboring points as they are seen [m].
     """
-    R_TN = _viewer_rotation(normal)
+    R_TN = viewer_rotation(normal)
     R_NO = R_TN.inverse() @ X_TO.rotation()
     corners_N = object_class.corners @ np.ascontiguousarray(R_NO.matrix()).T
     corners_N = corners_N + R_TN.inverse() @ X_TO.translation()
     lower, upper = corners_N.min(axis=0), corners_N.max(axis=0)
     p_NCm = R_TN.inverse() @ (X_TO @ object_class.center_of_mass)
-    for x, y in _grid_points(lower[:2], upper[:2], p_NCm[:2], spacing):
+    for x, y in grid_points(lower[:2], upper[:2], p_NCm[:2], spacing):
         p_NG = np.array([x, y, upper[2]])
         X_TG = RigidTransform(R_TN @ _FACING_ROTATION, R_TN @ p_NG)
         X_OG = X_TO.InvertAndCompose(X_TG)
@@ -236,7 +236,7 @@ def face_poses(
         yield X_TG
 
 
-def _viewer_rotation(normal: Floats) -> RotationMatrix:
+def viewer_rotation(normal: Floats) -> RotationMatrix:
     """Return R_TN of the frame of a viewer: z towards it, y up unless it is above."""
     up = np.array([0.0, 0.0, 1.0])
     x = np.cross(up, normal)

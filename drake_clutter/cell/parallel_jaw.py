@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from typing import Annotated, Literal
 
 import numpy as np
@@ -26,10 +27,12 @@ from drake_clutter.cell.gripper import (
     GraspFailure,
     GraspFailureReason,
     GraspSampling,
+    LazyGrasps,
     Payload,
     Tool,
 )
 from drake_clutter.cell.jaw_sdf import JawGeometry, jaw_sdf
+from drake_clutter.cell.opposed_faces import PadContact, closing_poses, find_pad_contact
 from drake_clutter.cell.payload_limits import max_payload_acceleration
 from drake_clutter.validation import InRange, StrictModel
 
@@ -41,6 +44,8 @@ _NUM_CYLINDER_ANGLES = 6
 """Number of directions in which a standing cylinder is grasped."""
 _MIN_PAD_OVERLAP = 0.008
 """Least height of the part of an object that is between the pads [m]."""
+_SHORTER_INSERTIONS = (0.0, 1 / 3, 2 / 3)
+"""Shares of the height of a pad by which the jaws reach less far than they can."""
 _PALM_CLEARANCE = 0.006
 """Distance of an object to the palm, and of the tips of the jaws to what the object is on [m]."""
 _PATCH_RADIUS = 0.011
@@ -111,15 +116,16 @@ class ParallelJawGripper(StrictModel):
         X_TO: RigidTransform,
         sampling: GraspSampling,
     ) -> Sequence[Grasp] | GraspFailure:
-        """Return grasps on two opposed faces from above, see `Gripper`.
+        """Return grasps on two opposed faces, see `Gripper`.
 
-        Boxes are grasped on two vertical faces, upright cylinders in several directions, lying ones
-        across. Meshes are not grasped, and no object is from its sides.
+        From above, boxes are grasped on two vertical faces, upright cylinders in several
+        directions, lying ones across. Meshes, and all objects from their sides, are grasped where
+        rays find opposed faces, see `opposed_faces`.
         """
+        if sampling.normal != UP or object_class.shape is Shape.MESH:
+            return self._sample_opposed_faces(object_class, X_TO, sampling)
         corners_T = object_class.corners @ np.ascontiguousarray(X_TO.rotation().matrix()).T
         corners_T = corners_T + X_TO.translation()
-        if sampling.normal != UP:
-            return GraspFailure(GraspFailureReason.NO_OPPOSED_FACES, math.inf)
         bottom, top = float(corners_T[:, 2].min()), float(corners_T[:, 2].max())
         height = self._pad_height(bottom, top)
         if height is None:
@@ -135,7 +141,8 @@ class ParallelJawGripper(StrictModel):
             y = np.array([*(direction[:2] / np.linalg.norm(direction[:2])), 0.0])
             R_TG = RotationMatrix(np.column_stack([np.cross(y, z), y, z]))
             X_TG = RigidTransform(R_TG, [*X_TO.translation()[:2], height])
-            grasp = self._grasp_at(object_class, X_TG, p_TCm, width, top)
+            insertion = top - height + self.geometry.pad_size[2] / 2
+            grasp = self._grasp_at(object_class, X_TG, p_TCm, width, insertion)
             if grasp.payload.max_acceleration >= sampling.min_payload_acceleration:
                 grasps.append(replace(grasp, num_angles=2))
         if grasps:
@@ -145,13 +152,82 @@ class ParallelJawGripper(StrictModel):
             return GraspFailure(GraspFailureReason.NO_OPPOSED_FACES, narrowest)
         return GraspFailure(GraspFailureReason.TOO_HEAVY, object_class.mass)
 
+    def _sample_opposed_faces(
+        self, object_class: ObjectClass, X_TO: RigidTransform, sampling: GraspSampling
+    ) -> Sequence[Grasp] | GraspFailure:
+        """Return grasps on opposed faces that rays find, see `sample_grasps`."""
+        normal = np.array(sampling.normal)
+        along_normal = X_TO.multiply(object_class.corners.T).T @ normal
+        bottom, top = float(along_normal.min()), float(along_normal.max())
+        # Only what is below an object keeps the tips of the jaws away.
+        height = self._pad_height(bottom if sampling.normal == UP else -math.inf, top)
+        if height is None:
+            return GraspFailure(GraspFailureReason.NO_OPPOSED_FACES, top - bottom)
+        max_insertion = top - height + self.geometry.pad_size[2] / 2
+        widths = list[float]()
+        grasps = LazyGrasps(
+            islice(
+                self._iterate_grasps(object_class, X_TO, sampling, max_insertion, widths),
+                sampling.max_grasps,
+            )
+        )
+        if next(iter(grasps), None):
+            return grasps
+        narrowest = min(widths, default=math.inf)
+        if narrowest + 2 * self.clearance > self.stroke:
+            return GraspFailure(GraspFailureReason.NO_OPPOSED_FACES, narrowest)
+        return GraspFailure(GraspFailureReason.TOO_HEAVY, object_class.mass)
+
+    def _iterate_grasps(
+        self,
+        object_class: ObjectClass,
+        X_TO: RigidTransform,
+        sampling: GraspSampling,
+        max_insertion: float,
+        widths: list[float],
+    ) -> Iterator[Grasp]:
+        """Yield grasps on opposed faces.
+
+        Args:
+            object_class: Class of the object.
+            X_TO: Pose of the object.
+            sampling: Parameters of the sampling.
+            max_insertion: Largest distance of the tips of the jaws below the side from which the
+                object is seen [m]. Shorter ones are tried where friction does not hold it.
+            widths: Receives the distances of what was between the pads [m].
+        """
+        p_TCm = X_TO @ object_class.center_of_mass
+        poses = closing_poses(object_class, X_TO, np.array(sampling.normal), sampling.spacing)
+        pad_height = float(self.geometry.pad_size[2])
+        shorter = [max_insertion - share * pad_height for share in _SHORTER_INSERTIONS]
+        insertions = [depth for depth in shorter if depth >= _MIN_PAD_OVERLAP]
+        for X_TS in poses:
+            for insertion in insertions:
+                X_TG = X_TS @ RigidTransform([0.0, 0.0, insertion - pad_height / 2])
+                contact = self._find_contact(object_class, X_TO, X_TG)
+                width = contact.width if isinstance(contact, PadContact) else contact
+                widths.append(width)
+                if not isinstance(contact, PadContact) or width + 2 * self.clearance > self.stroke:
+                    continue
+                grasp = self._grasp_at(object_class, contact.X_TG, p_TCm, width, insertion)
+                if grasp.payload.max_acceleration >= sampling.min_payload_acceleration:
+                    yield replace(grasp, num_angles=2)
+                    break
+
+    def _find_contact(
+        self, object_class: ObjectClass, X_TO: RigidTransform, X_TG: RigidTransform
+    ) -> PadContact | float:
+        """Return where the pads touch an object, see `find_pad_contact`."""
+        pad = self.geometry.pad_size[[0, 2]]
+        return find_pad_contact(object_class, X_TO, X_TG, pad, self.stroke, self.friction)
+
     def _grasp_at(
         self,
         object_class: ObjectClass,
         X_TG: RigidTransform,
         p_TCm: Floats,
         width: float,
-        top: float,
+        insertion: float,
     ) -> Grasp:
         """Return the grasp at a pose of the jaws.
 
@@ -160,7 +236,8 @@ class ParallelJawGripper(StrictModel):
             X_TG: Pose of the jaws.
             p_TCm: Center of mass of the object [m]. Shape (3,).
             width: Distance of the opposed faces [m].
-            top: Height of the object's highest point [m].
+            insertion: Distance of the tips of the jaws below the side of the object from which it
+                is seen [m].
         """
         p_GCm = X_TG.inverse() @ p_TCm
         down_G = -X_TG.rotation().matrix()[2]
@@ -172,7 +249,7 @@ class ParallelJawGripper(StrictModel):
             X_TG,
             Payload(object_class.mass, (x_F, y_F, z_F), round(acceleration, 1)),
             num_angles=1,
-            insertion=max(0.0, top - X_TG.translation()[2] + self.geometry.pad_size[2] / 2),
+            insertion=max(0.0, insertion),
             joints_open=(held - self.clearance,) * 2,
             joints_held=(held,) * 2,
         )
@@ -187,29 +264,25 @@ class ParallelJawGripper(StrictModel):
     ) -> Grasp | GraspFailure:
         """Return the grasp at a given pose of the jaws, see `Gripper`."""
         X_OG = X_TO.InvertAndCompose(X_TG)
-        corners_T = X_TO.multiply(object_class.corners.T).T
-        across = corners_T @ X_TG.rotation().matrix()[:, 1]
-        width = float(np.ptp(across))
-        is_between = self.can_attach(tool, object_class, X_OG)
-        if width + 2 * self.clearance > self.stroke or not is_between:
+        contact = self._find_contact(object_class, X_TO, X_TG)
+        if not isinstance(contact, PadContact):
+            return GraspFailure(GraspFailureReason.NO_OPPOSED_FACES, contact)
+        width = contact.width
+        if width + 2 * self.clearance > self.stroke:
             return GraspFailure(GraspFailureReason.NO_OPPOSED_FACES, width)
         p_TCm = X_TO @ object_class.center_of_mass
-        top = float(corners_T[:, 2].max())
-        grasp = self._grasp_at(object_class, X_TG, p_TCm, width, top)
+        corners_G = object_class.corners @ X_OG.rotation().matrix() + X_OG.inverse().translation()
+        insertion = self.geometry.pad_size[2] / 2 - float(corners_G[:, 2].min())
+        grasp = self._grasp_at(object_class, contact.X_TG, p_TCm, width, insertion)
         if grasp.payload.max_acceleration < sampling.min_payload_acceleration:
             acceleration = grasp.payload.max_acceleration
             return GraspFailure(GraspFailureReason.TOO_WEAK, acceleration)
         return grasp
 
     def can_attach(self, tool: str, object_class: ObjectClass, X_OG: RigidTransform) -> bool:
-        """Return whether an object is between the pads and narrower than the stroke."""
-        corners_G = object_class.corners @ X_OG.rotation().matrix() + (X_OG.inverse().translation())
-        lower, upper = corners_G.min(axis=0), corners_G.max(axis=0)
-        half = self.geometry.pad_size / 2
-        is_between = bool(
-            (lower[[0, 2]] < half[[0, 2]]).all() and (upper[[0, 2]] > -half[[0, 2]]).all()
-        )
-        return is_between and -self.stroke / 2 < lower[1] and upper[1] < self.stroke / 2
+        """Return whether faces of an object are between the pads, closer than the stroke."""
+        contact = self._find_contact(object_class, RigidTransform(), X_OG)
+        return isinstance(contact, PadContact) and contact.width < self.stroke
 
     def _pad_height(self, bottom: float, top: float) -> float | None:
         """Return the height of the pads' centers for an object [m]; None if it is too low."""

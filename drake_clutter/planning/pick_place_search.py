@@ -276,20 +276,20 @@ class PickPlaceSearch:
         )
         return replace(grasp.payload, max_acceleration=acceleration)
 
-    def _way_out(self, o: SceneObject, X_TG: Floats, load_distance: float) -> WayOut:
+    def _way_out(self, o: SceneObject, X_TG: Floats, candidate: GraspCandidate) -> WayOut:
         """Return the way out of a tool on a side of an object.
 
         Args:
             o: The object at its pose.
             X_TG: Pose of the tool. Shape (4, 4).
-            load_distance: See `GraspCandidate`.
+            candidate: Grasp.
         """
         if not is_sideways(X_TG):
             return WayOut()
         obstacles = [*self._fixed_corners, *(other.corners_T for other in self._others)]
-        clearance = self._config.min_distance + load_distance
+        clearance = self._config.min_distance + candidate.load_distance
         distance = distance_from_below(o.corners_T, -X_TG[:2, 2], obstacles, clearance)
-        return WayOut(clearance + RISE_CORNER, distance)
+        return WayOut(clearance + RISE_CORNER, distance, candidate.insertion)
 
     def _gripper_pose_at_pick(self, grasp: Grasp, yaw: float) -> Floats:
         """Return X_TG at the grasp, `PlannerConfig.lip_gap` above the surface. Shape (4, 4)."""
@@ -421,7 +421,7 @@ class PickPlaceSearch:
         ends = candidate.X_TG_pick, candidate.X_TG_place
         placed = replace(self._picked, X_TO=self._X_TO_goal)
         way_out, way_in = (
-            self._way_out(o, X_TG, candidate.load_distance)
+            self._way_out(o, X_TG, candidate)
             for o, X_TG in zip((self._picked, placed), ends, strict=True)
         )
         if self._is_held:

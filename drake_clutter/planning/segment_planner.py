@@ -140,8 +140,10 @@ class SegmentPlanner:
         empty = Payload()
         tool = self._tools[candidate.tool]
         # Without the object the tool leaves it upwards before it moves sideways.
-        lift = tool.extend_upwards(carry_path.reversed_approach, candidate.insertion)
-        lowering = tool.extend_upwards(carry_path.retreat, candidate.insertion)
+        # On a side, it has left the object before it moves upwards.
+        insertion = 0.0 if candidate.is_sideways else candidate.insertion
+        lift = tool.extend_upwards(carry_path.reversed_approach, insertion)
+        lowering = tool.extend_upwards(carry_path.retreat, insertion)
         if lift is None or lowering is None:
             self._failures.record(3, PlanningFailureReason.UNREACHABLE, "above the object")
             return None

@@ -132,10 +132,12 @@ class WayOut:
     Attributes:
         rise: Height by which a load is lifted first [m].
         distance: Distance that the load moves horizontally then [m]; 0 if nothing is above.
+        insertion: Distance by which the tool reaches beyond the side of the object [m].
     """
 
     rise: float = 0.0
     distance: float = 0.0
+    insertion: float = 0.0
 
 
 def _departure(X_TG: Floats, top: float, way_out: WayOut, *, has_load: bool) -> Floats:
@@ -161,7 +163,11 @@ def _departure(X_TG: Floats, top: float, way_out: WayOut, *, has_load: bool) -> 
     parts = list[Floats]()
     end = X_TG
     if not has_load:
-        parts.append(_translated(end, -X_TG[:3, 2], max(way_out.distance, DEPARTURE_DISTANCE)))
+        parts.append(
+            _translated(
+                end, -X_TG[:3, 2], max(way_out.distance, way_out.insertion + DEPARTURE_DISTANCE)
+            )
+        )
     elif way_out.distance > 0:
         parts.append(_translated(end, np.array([0.0, 0.0, 1.0]), way_out.rise))
         end = parts[-1][-1]
