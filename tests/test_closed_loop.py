@@ -27,7 +27,7 @@ from drake_clutter.resources import resource_path
 from drake_clutter.scenes.interfaces import Move, MoveResult, Observation
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.stability.ray_caster import RayCaster
-from drake_clutter.station.messages import PlannedMove, PlanRequest, PlanResponse
+from drake_clutter.station.messages import ExecutorStatus, PlannedMove, PlanRequest, PlanResponse
 from drake_clutter.systems import closed_loop
 from drake_clutter.systems.closed_loop import ClosedLoop
 from drake_clutter.systems.planner_system import PlannerSystem
@@ -61,8 +61,10 @@ def first_valid_move(
 class PolicyTestBench:
     """A policy system with scripted inputs."""
 
-    def __init__(self) -> None:
-        self.system = PolicySystem(policy=first_valid_move, config=ExplorationConfig(), seed=0)
+    def __init__(self, max_grips: int = 1) -> None:
+        self.system = PolicySystem(
+            policy=first_valid_move, config=ExplorationConfig(), seed=0, max_grips=max_grips
+        )
         self.simulator = Simulator(self.system)
         self.time = 0.0
         self.set_inputs(BEFORE, PlanResponse(), 0)
@@ -73,11 +75,14 @@ class PolicyTestBench:
         response: PlanResponse,
         finished: int,
         lowered_distance: float = 0.0,
+        status: ExecutorStatus | None = None,
     ) -> None:
         context = self.simulator.get_mutable_context()
         self.system.GetInputPort("observation").FixValue(context, observation)
         self.system.GetInputPort("response").FixValue(context, response)
         self.system.GetInputPort("finished").FixValue(context, [finished, lowered_distance])
+        if status is not None:
+            self.system.GetInputPort("status").FixValue(context, status)
 
     def advance(self, seconds: float) -> PolicyState:
         self.time += seconds
@@ -121,6 +126,17 @@ def test_the_policy_waits_for_the_move_before_it_observes_again() -> None:
     state = bench.advance(0.6)
     assert state.request.number == 2
     assert {o.name: o.X_TO for o in state.belief.objects} == ASIDE.poses
+
+
+def test_another_grasp_is_requested_for_the_same_move_while_none_seals() -> None:
+    bench, plan = PolicyTestBench(max_grips=2), make_plan()
+    first = bench.advance(0.1)
+    bench.set_inputs(BEFORE, PlanResponse(1, plan), 1, status=ExecutorStatus(1, "idle", True))
+    again = bench.advance(0.1)
+    assert (again.phase, again.decision) == (PolicyPhase.WAITING, first.decision)
+    assert again.request == replace(first.request, number=2, tried=(plan.held,))
+    bench.set_inputs(BEFORE, PlanResponse(2, plan), 2, status=ExecutorStatus(2, "idle", True))
+    assert bench.advance(0.2).belief.invalid_moves == (Move("cracker_box"),)
 
 
 def test_failed_moves_are_not_repeated() -> None:
@@ -184,7 +200,7 @@ def test_each_request_is_planned_once(monkeypatch: pytest.MonkeyPatch) -> None:
     bench, calls, plan = PolicyTestBench(), list[int](), make_plan()
     request = bench.advance(0.1).request
 
-    def plan_once(*_: object) -> PickPlacePlan | PlanningFailure:
+    def plan_once(*_: object, **__: object) -> PickPlacePlan | PlanningFailure:
         calls.append(1)
         return plan if len(calls) == 1 else NO_SEAL
 

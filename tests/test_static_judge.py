@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from conftest import CLASSES, resting, rng, scene_of, world_with
+from conftest import CLASSES, own_mesh_class, resting, rng, scene_of, world_with
 from scipy.spatial.transform import Rotation
 from test_settle import BELOW, FALLING, MARKER_PAIR, STABLE, STANDING_PAIR
-from test_suction import own_class, revolved
+from test_suction import revolved
 
 from drake_clutter.config import ClutterConfig
 from drake_clutter.grammar import Orientation
@@ -476,7 +476,7 @@ def test_an_object_tips_on_its_narrow_foot_under_an_eccentric_load(tmp_path: Pat
     The common center of mass leaves the foot at an offset of the box of 15 mm (1 + m / M), where m
     is the mass of the cone and M that of the box.
     """
-    cone = own_class(tmp_path, revolved([(0, 0), (0.015, 0), (0.060, 0.05), (0, 0.05)]))
+    cone = own_mesh_class(tmp_path, revolved([(0, 0), (0.015, 0), (0.060, 0.05), (0, 0.05)]))
     lower = SceneObject("cone", cone, Pose((0.0, 0.0, float(-cone.corners[:, 2].min()))))
     ratio = cone.mass / CLASSES["gelatin_box"].mass
     for x, y in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)):
@@ -493,7 +493,7 @@ def test_an_object_alone_topples_if_its_center_of_mass_is_beyond_its_foot(
     """Its section is a trapezoid, whose center of mass is 36 or 42 mm from the straight side."""
     section = np.array([(0.0, 0.0), (edge, 0.0), (0.100, 0.05), (0.0, 0.05)])
     hull = np.array([(x, y, z) for x, z in section for y in (-0.03, 0.03)])
-    own = own_class(tmp_path, trimesh.convex.convex_hull(hull))
+    own = own_mesh_class(tmp_path, trimesh.convex.convex_hull(hull))
     low, high = own.corners.min(axis=0), own.corners.max(axis=0)
     center = own.center_of_mass[0] - low[0]
     widths = np.array([edge, 0.100])

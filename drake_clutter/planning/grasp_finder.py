@@ -3,6 +3,7 @@
 Frames: T is the support, G is a tool of the gripper, O is the object.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 
@@ -12,6 +13,7 @@ from pydrake.math import RigidTransform
 from drake_clutter.cell.gripper import UP, Grasp, GraspFailure, GraspSampling, Gripper
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.files import InputError, format_value
+from drake_clutter.planning.motion_plan import HeldObject
 from drake_clutter.planning.pick_place_plan import PlanningFailure, PlanningFailureReason
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.side_grasps import side_normals
@@ -20,6 +22,10 @@ from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.simulation.scene_plant import rigid_transform
 
 Vector = tuple[float, float, float]
+
+_MAX_SAME_ANGLE = math.radians(15)
+"""Grasps whose orientations differ by less count as the same [rad]: half of the angle between two
+directions in which jaws grasp a standing cylinder."""
 
 
 class GraspFinder:
@@ -77,6 +83,40 @@ class GraspFinder:
             return from_above
         # A side on which the gripper seals, but does not hold the object, is closer to a grasp.
         return next((f for f in of_sides if f.reason is not from_above.reason), from_above)
+
+    def is_excluded(
+        self, picked: SceneObject, grasp: Grasp, excluded: Sequence[HeldObject]
+    ) -> bool:
+        """Return whether a grasp is one of those that are left out.
+
+        Grasps of a tool are the same if their points are closer than half of
+        `PlannerConfig.grasp_spacing`, and their orientations but for equally good angles about the
+        axis of the tool.
+
+        Args:
+            picked: Object at its pose.
+            grasp: Grasp of the object.
+            excluded: Grasps that are left out.
+        """
+        X_OG = rigid_transform(picked.X_TO).InvertAndCompose(grasp.X_TG)
+        for other in excluded:
+            X_GE = X_OG.InvertAndCompose(other.X_OG)
+            R = X_GE.rotation().matrix()
+            angle = math.atan2(R[1, 0], R[0, 0])
+            if grasp.num_angles:
+                turn = 2 * math.pi / grasp.num_angles
+                angle -= turn * round(angle / turn)
+            else:
+                angle = 0.0
+            tilt = math.acos(min(1.0, max(-1.0, float(R[2, 2]))))
+            distance = float(np.linalg.norm(X_GE.translation()))
+            if (
+                other.tool == grasp.tool
+                and distance < self._config.grasp_spacing / 2
+                and max(abs(angle), tilt) < _MAX_SAME_ANGLE
+            ):
+                return True
+        return False
 
     def make_grasp(
         self, picked: SceneObject, tool: str, X_OG: RigidTransform

@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
-from pydrake.trajectories import PiecewisePolynomial, Trajectory
+from pydrake.trajectories import PathParameterizedTrajectory, PiecewisePolynomial, Trajectory
 
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.files import InputError
@@ -98,7 +98,8 @@ class PlanStep:
 
     Attributes:
         name: `approach`, `grasp`, `lift`, `carry`, `release`, `retreat`, `move` or `hold`; with a
-            guarded descent also `steady`, `descend` and `rise`.
+            guarded descent also `steady`, `descend` and `rise`; `withdraw` back to the start of the
+            approach if the gripper has not grasped the object.
         trajectory: Joint positions over time. Shape (n,).
         payload: Load during the step.
         tool: Name of the tool that is commanded to hold an object; "" for none.
@@ -129,6 +130,13 @@ def stay_at(q: Sequence[float] | Floats, duration: float = DWELL_TIME) -> Trajec
         duration: Duration [s].
     """
     return PiecewisePolynomial.ZeroOrderHold([0.0, duration], np.column_stack([q, q]))
+
+
+def reverse(trajectory: Trajectory) -> Trajectory:
+    """Return a trajectory traversed backwards."""
+    end = trajectory.end_time()
+    scaling = PiecewisePolynomial.FirstOrderHold([0.0, end], [[end, 0.0]])
+    return PathParameterizedTrajectory(trajectory, scaling)
 
 
 class Plan(Protocol):

@@ -4,7 +4,7 @@ Frames: T is the support, G is a tool of the gripper, O is the picked object.
 """
 
 import time
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.trajectories import Trajectory
 
-from drake_clutter.cell.gripper import Grasp
+from drake_clutter.cell.gripper import Grasp, LazyGrasps
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.collision_model import CollisionModel
 from drake_clutter.planning.grasp_finder import GraspFinder
-from drake_clutter.planning.motion_plan import CellState
+from drake_clutter.planning.motion_plan import CellState, HeldObject
 from drake_clutter.planning.pick_place_plan import PlanningFailure, PlanningFailureReason
 from drake_clutter.planning.pick_place_search import FoundMove, MoveGoal, PickPlaceSearch
 from drake_clutter.planning.place_check import check_place
@@ -95,6 +95,7 @@ class MoveFinder:
         goal: MoveGoal,
         grasp: GraspChoice,
         occluded: Sequence[OccludedBox],
+        excluded: Sequence[HeldObject] = (),
     ) -> tuple[FoundMove, int] | PlanningFailure:
         """Return a motion that starts with an approach, and the number of attempts.
 
@@ -105,6 +106,7 @@ class MoveFinder:
             goal: Motion of the object.
             grasp: Grasps of the object.
             occluded: Occluded volumes, which count as obstacles.
+            excluded: Grasps that are left out.
         """
         start_time = time.perf_counter()
         if carried := objects_resting_on(goal.picked, state.objects):
@@ -123,6 +125,11 @@ class MoveFinder:
             return failure
         search = self.search(model, state, goal, occluded)
         failure = search.failures.furthest
+        if excluded:
+            candidates = self._without(goal.picked, candidates, excluded)
+            failure = PlanningFailure(
+                PlanningFailureReason.NO_GRASP_LEFT, goal.picked.name, float(len(excluded))
+            )
         for grasps in candidates:
             found = self._try_grasps(search, grasps, start_time)
             if not isinstance(found, PlanningFailure):
@@ -131,6 +138,20 @@ class MoveFinder:
             if failure.reason is PlanningFailureReason.TIME_OUT:
                 break
         return failure
+
+    def _without(
+        self,
+        picked: SceneObject,
+        candidates: Iterable[Sequence[Grasp]],
+        excluded: Sequence[HeldObject],
+    ) -> Iterator[Sequence[Grasp]]:
+        """Yield the grasps of each face without those that are left out, if there are others."""
+        for grasps in candidates:
+            others = LazyGrasps(
+                g for g in grasps if not self._grasp_finder.is_excluded(picked, g, excluded)
+            )
+            if next(iter(others), None) is not None:
+                yield others
 
     def find_held(
         self, state: CellState, goal: MoveGoal, occluded: Sequence[OccludedBox]

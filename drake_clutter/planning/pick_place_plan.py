@@ -23,7 +23,7 @@ from pydrake.trajectories import (
 
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.planning.collision_model import SignedDistance
-from drake_clutter.planning.motion_plan import CellState, HeldObject, PlanStep, stay_at
+from drake_clutter.planning.motion_plan import CellState, HeldObject, PlanStep, reverse, stay_at
 from drake_clutter.scenes.scene import Pose
 
 DESCENT_SPEED = 0.02
@@ -39,6 +39,7 @@ class PlanningFailureReason(Enum):
     NO_FREE_PLACEMENT = "no free spot"
     NO_SEAL = "no seal"
     NO_OPPOSED_FACES = "no opposed faces"
+    NO_GRASP_LEFT = "no grasp left"
     TOO_HEAVY = "too heavy"
     CARRIES_OTHERS = "carries others"
     PLACE_IN_COLLISION = "place in collision"
@@ -57,6 +58,7 @@ class PlanningFailureReason(Enum):
 _UNITS = {
     PlanningFailureReason.NO_SEAL: (1000.0, "mm"),
     PlanningFailureReason.NO_OPPOSED_FACES: (1000.0, "mm"),
+    PlanningFailureReason.NO_GRASP_LEFT: (1.0, "excluded"),
     PlanningFailureReason.TOO_HEAVY: (1.0, "kg"),
     PlanningFailureReason.PLACE_IN_COLLISION: (1000.0, "mm"),
     PlanningFailureReason.PLACE_TILTED: (math.degrees(1.0), "deg"),
@@ -79,11 +81,11 @@ class PlanningFailure:
         detail: Names of the colliding geometries, of the objects on top, or of the pose that is
             out of reach.
         value: Quantity that the reason refers to: flatness deviation of the surface under the best
-            grasp [m], mass [kg], signed distance [m], tilt [rad] or time [s]; of a place pose the
-            depth of penetration [m], the tilt [rad], the gap to what is below [m] or the distance
-            of the center of mass from the contact area [m]; of a configuration the excess of a
-            joint [rad]; of a weak grasp the acceleration that it bears [m/s^2]. NaN if there is
-            none.
+            grasp [m], mass [kg], signed distance [m], tilt [rad] or time [s]; number of excluded
+            grasps if none is left; of a place pose the depth of penetration [m], the tilt [rad],
+            the gap to what is below [m] or the distance of the center of mass from the contact
+            area [m]; of a configuration the excess of a joint [rad]; of a weak grasp the
+            acceleration that it bears [m/s^2]. NaN if there is none.
         planning_time: Wall time spent [s].
     """
 
@@ -334,7 +336,7 @@ def release_steps(
         PlanStep("steady", stay_at(q), held.payload, held.tool, closed),
         PlanStep("descend", lowered, held.payload, held.tool, closed, held.name, touched),
         PlanStep("release", dwell, held.payload, "", held.joints_open, held.name, touched),
-        PlanStep("rise", _reverse(lowered), Payload(), "", held.joints_open),
+        PlanStep("rise", reverse(lowered), Payload(), "", held.joints_open),
     )
 
 
@@ -342,13 +344,6 @@ def _truncate(trajectory: Trajectory, time: float) -> Trajectory:
     """Return a trajectory up to a time [s]."""
     end = min(time, trajectory.end_time())
     scaling = PiecewisePolynomial.FirstOrderHold([0.0, end], [[0.0, end]])
-    return PathParameterizedTrajectory(trajectory, scaling)
-
-
-def _reverse(trajectory: Trajectory) -> Trajectory:
-    """Return a trajectory traversed backwards."""
-    end = trajectory.end_time()
-    scaling = PiecewisePolynomial.FirstOrderHold([0.0, end], [[end, 0.0]])
     return PathParameterizedTrajectory(trajectory, scaling)
 
 

@@ -99,6 +99,7 @@ class PickPlacePlanner:
         occluded: Sequence[OccludedBox] = (),
         *,
         grasp: GraspChoice = None,
+        exclude: Sequence[HeldObject] = (),
         start: Sequence[float] | None = None,
         end: Sequence[float] | None = None,
     ) -> PickPlacePlan | PlanningFailure:
@@ -111,6 +112,8 @@ class PickPlacePlanner:
             occluded: Occluded volumes, which count as obstacles.
             grasp: Grasp of the object, see `make_grasp`, or several, see `grasps`; None to sample
                 grasps from above, then from its sides.
+            exclude: Grasps that are left out, such as `PickPlacePlan.held` of a plan with which the
+                gripper did not grasp the object.
             start: Joint positions at the start [rad]; None for home. Shape (n,).
             end: Joint positions at the end [rad]; None for home. Shape (n,).
 
@@ -132,7 +135,7 @@ class PickPlacePlanner:
         for offset in dict.fromkeys((start_offset, 0.0)):
             X_TO_start = X_TO_place.translated((0.0, 0.0, offset))
             goal = MoveGoal(picked, X_TO_start, self.config.lift_height, True, q_end)
-            found = self._finder.find_pick(state, goal, grasp, occluded)
+            found = self._finder.find_pick(state, goal, grasp, occluded, exclude)
             if isinstance(found, PlanningFailure):
                 return replace(found, planning_time=time.perf_counter() - start_time)
             move, num_attempts = found
@@ -165,6 +168,7 @@ class PickPlacePlanner:
         pick: str,
         *,
         grasp: GraspChoice = None,
+        exclude: Sequence[HeldObject] = (),
         lift_height: float | None = None,
         occluded: Sequence[OccludedBox] = (),
     ) -> MotionPlan | PlanningFailure:
@@ -175,6 +179,7 @@ class PickPlacePlanner:
             pick: Name of the object.
             grasp: Grasp of the object, see `make_grasp`, or several, see `grasps`; None to sample
                 grasps from above, then from its sides.
+            exclude: Grasps that are left out, see `plan`.
             lift_height: Height by which it is lifted at least [m]; None for that of the
                 configuration.
             occluded: Occluded volumes, which count as obstacles.
@@ -188,7 +193,7 @@ class PickPlacePlanner:
         height = self.config.lift_height if lift_height is None else lift_height
         check_positive(height, "lift_height")
         goal = MoveGoal(find_object(state.objects, pick), None, height, False, None)
-        found = self._finder.find_pick(state, goal, grasp, occluded)
+        found = self._finder.find_pick(state, goal, grasp, occluded, exclude)
         if isinstance(found, PlanningFailure):
             return replace(found, planning_time=time.perf_counter() - start_time)
         move, _ = found

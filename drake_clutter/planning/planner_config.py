@@ -1,7 +1,14 @@
 """Parameters of the pick-and-place planner."""
 
 from drake_clutter.planning.carry_clearance import CarryClearance
-from drake_clutter.validation import CountOrZero, Flag, NonNegative, config_class, renamed_fields
+from drake_clutter.validation import (
+    Count,
+    CountOrZero,
+    Flag,
+    NonNegative,
+    config_class,
+    renamed_fields,
+)
 
 
 @config_class
@@ -34,6 +41,8 @@ class PlannerConfig:
             direction [m/s^2].
         time_limit: Time after which planning fails [s]. The default is never reached in practice,
             so that results do not depend on the speed of the machine.
+        max_grips: Largest number of grasps that are tried one after the other while the vacuum of
+            a cup does not build up.
         max_guarded_descent: Largest distance by which the object is lowered below its place pose
             until contact is detected [m]. 0 disables the guarded descent.
         descent_start_offset: Height above the place pose at which the guarded descent starts [m].
@@ -51,6 +60,7 @@ class PlannerConfig:
     max_attempts: CountOrZero = 400
     min_payload_acceleration: NonNegative = 0.3
     time_limit: NonNegative = 600.0
+    max_grips: Count = 3
     max_guarded_descent: NonNegative = 0.0
     descent_start_offset: NonNegative = 0.0
     carry_clearance: CarryClearance = CarryClearance()

@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 PHASES = (
     *("idle", "approach", "grasp", "lift", "carry", "steady", "descend", "release", "rise"),
-    *("retreat", "move", "hold"),
+    *("retreat", "move", "hold", "withdraw"),
 )
 """Names of the steps of a plan, see `PlanStep`, and `idle` without one."""
 POSE_COLUMNS = ("qw", "qx", "qy", "qz", "x", "y", "z")

@@ -216,6 +216,8 @@ class MoveResult(Enum):
             ended in time.
         NOT_PLANNED: No motion plan was found.
         DROPPED: The gripper lost the object on the way.
+        NOT_GRASPED: The gripper did not grasp the object, which is where it was, and the scene is
+            stable.
     """
 
     PLACED = "placed"
@@ -226,11 +228,13 @@ class MoveResult(Enum):
     INCONCLUSIVE = "cannot be judged"
     NOT_PLANNED = "not planned"
     DROPPED = "dropped"
+    NOT_GRASPED = "not grasped"
 
     @property
     def was_executed(self) -> bool:
-        """Whether anything was moved."""
-        return self.is_at_placement or self is MoveResult.DROPPED or self.ends_episode
+        """Whether the arm moved."""
+        lost = self in (MoveResult.DROPPED, MoveResult.NOT_GRASPED)
+        return self.is_at_placement or lost or self.ends_episode
 
     @property
     def is_at_placement(self) -> bool:

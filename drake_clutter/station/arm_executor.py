@@ -2,11 +2,13 @@
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from drake_clutter.cell.support import Support
 from drake_clutter.config import ClutterConfig, SettleConfig
+from drake_clutter.planning.motion_plan import HeldObject
 from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
@@ -60,10 +62,19 @@ class ArmExecutor:
         self._planner_config = planner_config or PlannerConfig()
         self._planner: PickPlacePlanner | None = None
 
-    def plan(self, scene: Scene, command: PickPlaceCommand) -> PickPlacePlan | PlanningFailure:
-        """Return the plan for a command, or the reason why there is none."""
+    def plan(
+        self, scene: Scene, command: PickPlaceCommand, exclude: Sequence[HeldObject] = ()
+    ) -> PickPlacePlan | PlanningFailure:
+        """Return the plan for a command, or the reason why there is none.
+
+        Args:
+            scene: Objects at rest.
+            command: Move with its poses.
+            exclude: Grasps that are left out.
+        """
         planner = self.planner_for(scene.support)
-        return planner.plan(scene.objects, command.move.pick, command.X_TO_place)
+        pick, X_TO_place = command.move.pick, command.X_TO_place
+        return planner.plan(scene.objects, pick, X_TO_place, exclude=exclude)
 
     def planner_for(self, support: Support) -> PickPlacePlanner:
         """Return the planner for a support; the planner of the last support is cached."""
@@ -83,21 +94,33 @@ class ArmExecutor:
                 detail=str(plan),
                 failure_reason=plan.reason.value,
             )
-        result = simulate_plan(self._config.cell, scene, plan, rate=self._rate)
+        result = simulate_plan(
+            self._config.cell,
+            scene,
+            plan,
+            rate=self._rate,
+            regrip=partial(self.plan, scene, command),
+            max_grips=self._planner_config.max_grips,
+        )
         if not result.has_ended:
             return Outcome(MoveResult.INCONCLUSIVE, scene, detail=str(result))
+        assert isinstance(result.plan, PickPlacePlan)
         # The arm lowers the object beyond its planned pose until contact.
-        X_TO_place = plan.X_TO_place.translated((0.0, 0.0, -result.lowered_distance))
+        X_TO_place = result.plan.X_TO_place.translated((0.0, 0.0, -result.lowered_distance))
         after = scene.with_poses(result.poses)
-        outcome = evaluate_outcome(
-            scene,
-            after,
-            command.move.pick,
-            X_TO_place,
-            result.lost_object,
-            self._config.settle,
-            is_beside=command.is_beside(scene.support),
-        )
+        pick, settle = command.move.pick, self._config.settle
+        if result.has_no_seal:
+            outcome = evaluate_no_grasp(scene, after, pick, settle)
+        else:
+            outcome = evaluate_outcome(
+                scene,
+                after,
+                pick,
+                X_TO_place,
+                result.lost_object,
+                settle,
+                is_beside=command.is_beside(scene.support),
+            )
         return replace(outcome, samples=result.samples, detail=str(result))
 
 
@@ -152,6 +175,21 @@ def evaluate_outcome(
     if instability is not None:
         result = MoveResult.of_instability(instability)
     return Outcome(result, after, instability, X_TO_released=X_TO_place)
+
+
+def evaluate_no_grasp(before: Scene, after: Scene, pick: str, config: SettleConfig) -> Outcome:
+    """Return the outcome of a motion that was to pick an object and went back without it.
+
+    Args:
+        before: Scene at rest before the motion.
+        after: Scene after the motion.
+        pick: Name of the object.
+        config: Limits of displacement and tilt.
+    """
+    outcome = evaluate_outcome(before, after, pick, before[pick].X_TO, False, config)
+    if outcome.result is not MoveResult.PLACED:
+        return outcome
+    return replace(outcome, result=MoveResult.NOT_GRASPED, X_TO_released=None)
 
 
 def worst_instability(

@@ -2,7 +2,8 @@
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.arm_dynamics import arm_dynamics
-from drake_clutter.planning.motion_plan import CellState, Plan, PlanStep
+from drake_clutter.planning.motion_plan import CellState, Plan, PlanStep, reverse
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.planning.time_parameterization import sample_motion
 
@@ -155,6 +156,42 @@ def build_command_schedule(
             releases the object and rises by the same distance.
     """
     steps = plan.steps_until(contact_time) if isinstance(plan, PickPlacePlan) else plan.steps
+    return _schedule_steps(steps, cell, plan.start, plan.end)
+
+
+def build_withdrawal_schedule(
+    schedule: CommandSchedule, plan: Plan, cell: WorkCell, time: float
+) -> CommandSchedule:
+    """Return the schedule of a plan that ends with a grasp without an object.
+
+    The arm goes back on the way on which it came, which has room for it.
+
+    Args:
+        schedule: Schedule of the plan.
+        plan: Plan that is executed.
+        cell: Work cell with robot and gripper.
+        time: Time during the grasp since the start of the plan [s].
+    """
+    grasp = bisect_right(schedule.starts, time) - 1
+    steps = schedule.steps[: grasp + 1]
+    steps += tuple(
+        PlanStep("withdraw", reverse(step.trajectory), joints=step.joints)
+        for step in steps[:-1][-1:]
+    )
+    return _schedule_steps(steps, cell, plan.start, replace(plan.start, held=None))
+
+
+def _schedule_steps(
+    steps: Sequence[PlanStep], cell: WorkCell, first: CellState, last: CellState
+) -> CommandSchedule:
+    """Return the command schedule of steps.
+
+    Args:
+        steps: Steps in order.
+        cell: Work cell with robot and gripper.
+        first: State at the start.
+        last: State at the end.
+    """
     time = 0.0
     times = list[Floats]()
     commands = list[Floats]()
@@ -173,9 +210,9 @@ def build_command_schedule(
         [stage + (1e-6 * (k > 0)) * (stage == stage[0]) for k, stage in enumerate(times)]
     )
     num_joints = cell.gripper.num_actuated_joints
-    targets = [(0.0, _joints_at_rest(plan.start, num_joints))]
+    targets = [(0.0, _joints_at_rest(first, num_joints))]
     targets += [(start, np.array(step.joints)) for start, step in zip(starts, steps, strict=True)]
-    targets.append((time - JAW_MOVING_TIME, _joints_at_rest(plan.end, num_joints)))
+    targets.append((time - JAW_MOVING_TIME, _joints_at_rest(last, num_joints)))
     return CommandSchedule(
         command=PiecewisePolynomial.FirstOrderHold(breaks, np.vstack(commands).T),
         steps=tuple(steps),

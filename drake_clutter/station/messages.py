@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 
 from drake_clutter.cell.work_cell import default_cell
-from drake_clutter.planning.motion_plan import Plan
+from drake_clutter.planning.motion_plan import HeldObject, Plan
 from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
 from drake_clutter.scenes.interfaces import Move, Observation, PickPlaceCommand
 from drake_clutter.scenes.scene import SceneObject
@@ -41,12 +41,14 @@ class PlanRequest(Message):
         command: Move with its pick and place poses; None if no free placement was found.
         observation: Observation on which the move is based.
         objects: Known objects (K_t) at that time.
+        tried: Grasps of the move with which the gripper did not grasp the object.
     """
 
     move: Move | None = None
     command: PickPlaceCommand | None = None
     observation: Observation | None = field(default=None, repr=False)
     objects: tuple[SceneObject, ...] = field(default=(), repr=False)
+    tried: tuple[HeldObject, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -82,9 +84,11 @@ class ExecutorStatus(Message):
     Attributes:
         number: Number of the plan.
         stage: Stage of the plan, see `CommandSchedule.stage_at`; "idle" if none is executed.
+        has_no_seal: Whether no vacuum has built up at the grasp of the plan.
     """
 
     stage: str = "idle"
+    has_no_seal: bool = False
 
 
 def empty_observation() -> Observation:

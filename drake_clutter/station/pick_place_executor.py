@@ -26,6 +26,7 @@ from drake_clutter.station.command_schedule import (
     CommandSchedule,
     RecordedSchedule,
     build_command_schedule,
+    build_withdrawal_schedule,
 )
 from drake_clutter.station.messages import ExecutorStatus, Message, PlannedMove
 
@@ -55,6 +56,7 @@ class ExecutorState(Message):
         contact_time: Time between the start of the guarded descent and contact [s]; infinite
             without contact.
         waited: Time for which the arm has waited for the vacuum, beyond the planned dwell [s].
+        has_no_seal: Whether no vacuum has built up, so that the arm goes back without the object.
     """
 
     plan: Plan | None = None
@@ -63,11 +65,14 @@ class ExecutorState(Message):
     bellows_extension: float = math.nan
     contact_time: float = math.inf
     waited: float = 0.0
+    has_no_seal: bool = False
 
     @property
     def lowered_distance(self) -> float:
         """Distance between the planned and the actual release height [m]."""
         if not isinstance(self.plan, PickPlacePlan) or self.plan.guarded_descent is None:
+            return 0.0
+        if self.has_no_seal:
             return 0.0
         return self.plan.guarded_descent.depth_at(self.contact_time)
 
@@ -116,8 +121,8 @@ class PickPlaceExecutor(LeafSystem):
             descent ends when the bellows of the tool are compressed, or at its planned end. Shape
             (2 k,).
         vacuum: Vacuum of each suction cup [Pa]; only with suction cups. The arm does not lift an
-            object before `SuctionGripper.lift_vacuum`, or `grip_timeout` later than planned. Shape
-            (num_cups,).
+            object before `SuctionGripper.lift_vacuum`, or `grip_timeout` later than planned; below
+            `detection_vacuum` it goes back then without the object. Shape (num_cups,).
 
     Output ports:
         command: Desired positions [rad], desired velocities [rad/s] and feed-forward torques [N m]
@@ -199,7 +204,10 @@ class PickPlaceExecutor(LeafSystem):
         return EventStatus.Succeeded()
 
     def _await_vacuum(self, context: Context, state: ExecutorState) -> ExecutorState:
-        """Return the state, delayed if a grasp is about to end without enough vacuum."""
+        """Return the state, delayed if a grasp is about to end without enough vacuum.
+
+        If no vacuum builds up in `grip_timeout`, the arm goes back.
+        """
         gripper, schedule = self._cell.gripper, state.schedule
         if isinstance(schedule, RecordedSchedule):
             time = context.get_time() - state.start_time
@@ -209,8 +217,8 @@ class PickPlaceExecutor(LeafSystem):
         if (
             not isinstance(gripper, SuctionGripper)
             or schedule is None
+            or state.has_no_seal
             or not self._vacuum.HasValue(context)
-            or state.waited + EXECUTOR_UPDATE_PERIOD > gripper.grip_timeout
         ):
             return state
         elapsed = state.elapsed(context.get_time())
@@ -221,6 +229,12 @@ class PickPlaceExecutor(LeafSystem):
         vacuum = float(self._vacuum.Eval(context)[list(self._tools).index(tool)])
         if vacuum >= gripper.lift_vacuum * gripper.full_vacuum:
             return state
+        if state.waited + EXECUTOR_UPDATE_PERIOD > gripper.grip_timeout:
+            if vacuum >= gripper.detection_vacuum:
+                return state
+            assert state.plan is not None
+            withdrawal = build_withdrawal_schedule(schedule, state.plan, self._cell, elapsed)
+            return replace(state, schedule=withdrawal, has_no_seal=True)
         return replace(state, waited=state.waited + EXECUTOR_UPDATE_PERIOD)
 
     def _detect_contact(self, context: Context, state: ExecutorState) -> ExecutorState:
@@ -286,4 +300,4 @@ class PickPlaceExecutor(LeafSystem):
         stage = "idle"
         if state.schedule is not None:
             stage = state.schedule.stage_at(state.elapsed(context.get_time()))
-        output.set_value(ExecutorStatus(state.number, stage))
+        output.set_value(ExecutorStatus(state.number, stage, state.has_no_seal))

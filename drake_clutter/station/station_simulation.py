@@ -9,7 +9,7 @@ result = simulation.execute(plan)
 """
 
 import math
-from collections.abc import Callable, Mapping, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,8 +20,8 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.files import InputError, format_value
 from drake_clutter.limits import MAX_MOTION_DURATION
-from drake_clutter.planning.motion_plan import Plan
-from drake_clutter.planning.pick_place_plan import PickPlacePlan
+from drake_clutter.planning.motion_plan import HeldObject, Plan
+from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
 from drake_clutter.scenes.action_samples import ActionSamples
 from drake_clutter.scenes.scene import Pose, Scene, tilt_between
 from drake_clutter.station.body_sleep import BodySleepManager, affected_bodies, bodies_to_wake
@@ -65,6 +65,8 @@ It is longer than the arm may wait for the vacuum of a few grasps.
 POST_MOTION_WAIT = 1.0
 """Time after the end of a plan in which fallen objects stay awake [s]."""
 
+Regrip = Callable[[Sequence[HeldObject]], PickPlacePlan | PlanningFailure]
+"""Returns a plan with another grasp than those that did not hold the object."""
 AddSystems = Callable[[DiagramBuilder, ClutterStation, PickPlaceExecutor], None]
 """Adds systems to a diagram and connects them, including the input port `plan` of the executor."""
 
@@ -80,8 +82,11 @@ class PickPlaceResult:
     """Result of the execution of a plan.
 
     Attributes:
+        plan: Plan that was executed, the last one of several grasps.
         poses: Poses X_TO at the end, by name.
         grasped: Whether the gripper held an object.
+        has_no_seal: Whether no vacuum built up, so that the arm went back without the object.
+        num_grips: Number of grasps that were tried one after the other, see `Regrip`.
         drop_time: Time at which the object came off by overload [s]; NaN if it did not.
         max_load_ratio: Largest ratio of the load to the load capacity of the gripper.
         slip: Displacement between object and gripper from grasp to release [m].
@@ -95,6 +100,7 @@ class PickPlaceResult:
         has_ended: Whether the plan has ended within `MAX_OVERTIME` of its duration.
     """
 
+    plan: Plan = field(repr=False)
     poses: dict[str, Pose]
     grasped: bool
     drop_time: float
@@ -108,6 +114,8 @@ class PickPlaceResult:
     simulated_time: float
     samples: ActionSamples | None = field(repr=False, default=None)
     has_ended: bool = True
+    has_no_seal: bool = False
+    num_grips: int = 1
 
     @property
     def lost_object(self) -> bool:
@@ -129,7 +137,8 @@ class PickPlaceResult:
         if not self.has_ended:
             return f"the motion had not ended after {self.simulated_time:.2f} s"
         if not self.grasped:
-            return "the gripper did not grasp the object"
+            grips = "" if self.num_grips == 1 else f" with {self.num_grips} grasps"
+            return f"the gripper did not grasp the object{grips}"
         if not math.isnan(self.drop_time):
             return f"came off the gripper after {self.drop_time:.2f} s"
         millimeters = 1000 * self.position_error
@@ -317,6 +326,8 @@ class StationSimulation:
                     if isinstance(state.schedule, RecordedSchedule)
                     else affected_bodies(self.scene.objects, state.plan)
                 )
+            # A plan without a seal has fewer steps, the last of which touches nothing.
+            self._affected = self._affected[: len(state.schedule.steps)]
             elapsed = self.root.get_time() - state.start_time - state.waited
             required = bodies_to_wake(state.schedule, self._affected, elapsed)
             end = state.schedule.end_time + POST_MOTION_WAIT
@@ -403,6 +414,7 @@ class StationSimulation:
         names = {step.object_name for step in plan.steps if step.object_name} | held
         moved = [o for o in plan.end.objects if o.name in names]
         return PickPlaceResult(
+            plan=plan,
             poses=poses,
             grasped=status.has_held,
             drop_time=status.release_time,
@@ -424,6 +436,7 @@ class StationSimulation:
             max_tracking_error=max_tracking_error,
             simulated_time=self.root.get_time(),
             samples=self.recorded_samples(),
+            has_no_seal=self.executor_state.has_no_seal,
         )
 
     def recorded_samples(self) -> ActionSamples | None:
@@ -456,8 +469,41 @@ class StationSimulation:
         )
 
 
+def execute_grips(
+    simulation: StationSimulation,
+    plan: PickPlacePlan,
+    regrip: Regrip | None = None,
+    max_grips: int = 1,
+) -> PickPlaceResult:
+    """Execute a plan, and plans with other grasps while the gripper does not grasp the object.
+
+    Args:
+        simulation: Simulation, with the arm at the start of the plan.
+        plan: First plan.
+        regrip: Plans with another grasp; None to execute only the first plan.
+        max_grips: Largest number of plans that are executed.
+    """
+    tried = list[HeldObject]()
+    while True:
+        result = simulation.execute(plan)
+        tried.append(plan.held)
+        if not result.has_no_seal or regrip is None or len(tried) >= max_grips:
+            break
+        found = regrip(tried)
+        if isinstance(found, PlanningFailure):
+            break
+        plan = found
+    return replace(result, num_grips=len(tried))
+
+
 def simulate_plan(
-    cell: WorkCell, scene: Scene, plan: PickPlacePlan, *, rate: float | None = None
+    cell: WorkCell,
+    scene: Scene,
+    plan: PickPlacePlan,
+    *,
+    rate: float | None = None,
+    regrip: Regrip | None = None,
+    max_grips: int = 1,
 ) -> PickPlaceResult:
     """Execute a plan in a simulation of its own.
 
@@ -470,15 +516,17 @@ def simulate_plan(
         scene: Objects at rest.
         plan: Plan to execute.
         rate: Samples per second [Hz]; None records nothing.
+        regrip: See `execute_grips`.
+        max_grips: See `execute_grips`.
     """
     affected = frozenset[str]().union(*affected_bodies(scene.objects, plan))
     coarse = StationSimulation(cell, scene, movable=affected, time_step=COARSE_TIME_STEP, rate=rate)
-    result = coarse.execute(plan)
+    result = execute_grips(coarse, plan, regrip, max_grips)
     is_accepted = result.is_uneventful and not coarse.woken_fixed_objects
     coarse.release()
     if is_accepted:
         return result
     fine = StationSimulation(cell, scene, rate=rate)
-    result = fine.execute(plan)
+    result = execute_grips(fine, plan, regrip, max_grips)
     fine.release()
     return result

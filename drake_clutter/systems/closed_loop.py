@@ -25,7 +25,7 @@ from drake_clutter.scenes.action_samples import ActionSamples
 from drake_clutter.scenes.geometry import transport_pose
 from drake_clutter.scenes.interfaces import MoveResult, Outcome
 from drake_clutter.scenes.scene import Scene, SceneObject
-from drake_clutter.station.arm_executor import evaluate_outcome
+from drake_clutter.station.arm_executor import evaluate_no_grasp, evaluate_outcome
 from drake_clutter.station.body_sleep import nearest_object
 from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.messages import PlanResponse
@@ -126,6 +126,7 @@ class ClosedLoop:
             seed=seed,
             tracker=None if perceive is None else associate_detections,
             action_filter=InfeasibleMoveFilter(self._pickable, empty_depth, self.config),
+            max_grips=planner_config.max_grips,
         )
         self.planner_system = PlannerSystem(
             planner=self._planner,
@@ -160,6 +161,7 @@ class ClosedLoop:
             (perception, "observation", policy, "observation"),
             (planner, "response", policy, "response"),
             (executor, "finished", policy, "finished"),
+            (executor, "status", policy, "status"),
             (policy, "request", planner, "request"),
             (planner, "plan", executor, "plan"),
         ):
@@ -202,7 +204,8 @@ class ClosedLoop:
             samples = self._take_samples() or samples
             previous, state = state, self._state
             is_done = state.phase is PolicyPhase.DONE
-            has_observed = is_done or state.request.number != previous.request.number
+            # A request for another grasp follows from the same decision.
+            has_observed = is_done or state.decision is not previous.decision
             if has_observed and previous.request.number:
                 yield self._attempt(previous, samples)
                 samples = None
@@ -236,14 +239,19 @@ class ClosedLoop:
             assert observation is not None
             known = state.request.objects
             decision = to_ground_truth_names(decision, known, observation, before.objects)
-        if isinstance(plan, PlanningFailure):
+        if isinstance(plan, PlanningFailure) and not state.request.tried:
             is_full = plan.reason is PlanningFailureReason.NO_FREE_PLACEMENT
             result = MoveResult.NO_FREE_PLACEMENT if is_full else MoveResult.NOT_PLANNED
             outcome = Outcome(result, before, detail="" if is_full else str(plan))
             outcome = replace(outcome, failure_reason=plan.reason.value)
             return MoveAttempt(decision, outcome, self.perception)
-        picked, outcome = self._outcome(plan)
         assert decision.move is not None
+        if isinstance(plan, PlanningFailure) or self.simulation.executor_state.has_no_seal:
+            picked = decision.move.pick
+            outcome = evaluate_no_grasp(before, self.simulation.scene, picked, self._config.settle)
+            outcome = replace(outcome, detail="no vacuum built up")
+        else:
+            picked, outcome = self._outcome(plan)
         decision = replace(decision, move=replace(decision.move, pick=picked))
         # The true poses of the simulation are the next move's initial ones.
         self.scene = self.simulation.scene

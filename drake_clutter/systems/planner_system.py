@@ -95,7 +95,9 @@ class PlannerSystem(LeafSystem):
             return PlanningFailure(PlanningFailureReason.NO_FREE_PLACEMENT, request.move.place)
         occluded = occluded_boxes(request.objects, request.observation, self._empty_depth)
         X_TO_place = request.command.X_TO_place
-        return self._planner.plan(request.objects, request.move.pick, X_TO_place, occluded)
+        return self._planner.plan(
+            request.objects, request.move.pick, X_TO_place, occluded, exclude=request.tried
+        )
 
     def _calc_response(self, context: Context, output: AbstractValue) -> None:
         output.set_value(self.response(context))

@@ -11,7 +11,12 @@ from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.scenes.interfaces import MoveResult, Observation
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.seeding import item_rng
-from drake_clutter.station.messages import PlanRequest, PlanResponse, empty_observation
+from drake_clutter.station.messages import (
+    ExecutorStatus,
+    PlanRequest,
+    PlanResponse,
+    empty_observation,
+)
 from drake_clutter.tasks.belief import (
     ActionFilter,
     Belief,
@@ -67,6 +72,7 @@ class PolicySystem(LeafSystem):
         - observation
         - response
         - finished
+        - status
         output_ports:
         - request
         - state
@@ -76,6 +82,8 @@ class PolicySystem(LeafSystem):
         response: `PlanResponse`, abstract.
         finished: Number of the latest finished plan, and by how much the object was released below
             its planned pose [m]. Shape (2,).
+        status: `ExecutorStatus`, abstract; without one, every motion counts as a move of the
+            object. Where no vacuum has built up, another grasp is requested for the same move.
 
     Output ports:
         request: Latest `PlanRequest`, abstract.
@@ -93,6 +101,7 @@ class PolicySystem(LeafSystem):
         policy: Policy | None = None,
         tracker: Tracker | None = None,
         action_filter: ActionFilter | None = None,
+        max_grips: int = 1,
         post_motion_wait: float = 0.5,
     ) -> None:
         """Create the system.
@@ -103,6 +112,7 @@ class PolicySystem(LeafSystem):
             policy: Policy that chooses the moves; None: the attribute is set later.
             tracker: Associates detections with known objects; None: their names are persistent.
             action_filter: Returns infeasible moves; None: every legal move is feasible.
+            max_grips: Largest number of grasps of a move, see `PlannerConfig`.
             post_motion_wait: Time for objects to come to rest after a move [s].
         """
         super().__init__()
@@ -112,6 +122,7 @@ class PolicySystem(LeafSystem):
         self._post_motion_wait = post_motion_wait
         self._tracker = tracker
         self._action_filter = action_filter
+        self._max_grips = max_grips
         self._observation = self.DeclareAbstractInputPort(
             "observation", AbstractValue.Make(empty_observation())
         )
@@ -119,6 +130,7 @@ class PolicySystem(LeafSystem):
             "response", AbstractValue.Make(PlanResponse())
         )
         self._finished = self.DeclareVectorInputPort("finished", 2)
+        self._status = self.DeclareAbstractInputPort("status", AbstractValue.Make(ExecutorStatus()))
         self._state = self.DeclareAbstractState(AbstractValue.Make(PolicyState()))
         self.DeclarePeriodicUnrestrictedUpdateEvent(UPDATE_PERIOD, 0.0, self._update)
         state_only = {self.all_state_ticket()}
@@ -153,17 +165,33 @@ class PolicySystem(LeafSystem):
         if response.number != now.request.number:
             return now
         if not isinstance(response.plan, PickPlacePlan):
-            belief = now.belief.record(move, MoveResult.NOT_PLANNED)
+            has_tried = bool(now.request.tried)
+            result = MoveResult.NOT_GRASPED if has_tried else MoveResult.NOT_PLANNED
+            belief = now.belief.record(move, result)
             return replace(now, phase=PolicyPhase.OBSERVING, observation_time=time, belief=belief)
         finished, lowered_distance = self._finished.Eval(context)
         if finished != now.request.number:
             return now
+        if self._has_no_seal(context):
+            tried = (*now.request.tried, response.plan.held)
+            if len(tried) < self._max_grips:
+                number = now.request.number + 1
+                return replace(now, request=replace(now.request, number=number, tried=tried))
+            belief = now.belief.record(move, MoveResult.NOT_GRASPED)
+            return replace(now, phase=PolicyPhase.OBSERVING, observation_time=time, belief=belief)
         X_TO = response.plan.X_TO_place.translated((0.0, 0.0, -lowered_distance))
         belief = now.belief.record(move, MoveResult.PLACED, X_TO)
         observation_time = time + self._post_motion_wait
         return replace(
             now, phase=PolicyPhase.OBSERVING, observation_time=observation_time, belief=belief
         )
+
+    def _has_no_seal(self, context: Context) -> bool:
+        """Return whether the executor has found no vacuum at the grasp of the latest plan."""
+        if not self._status.HasValue(context):
+            return False
+        status: ExecutorStatus = self._status.Eval(context)
+        return status.has_no_seal
 
     def after_observation(self, now: PolicyState, observation: Observation) -> PolicyState:
         """Return the state after an observation: with a request, or done.
@@ -181,6 +209,7 @@ class PolicySystem(LeafSystem):
             return replace(now, belief=belief, phase=PolicyPhase.DONE, decision=decision)
         rng = item_rng(self._seed, number)
         command = resolve_placement(decision.move, observation, self._config, rng)
+        number = now.request.number + 1
         request = PlanRequest(number, decision.move, command, observation, belief.objects)
         return PolicyState(PolicyPhase.WAITING, now.observation_time, belief, request, decision)
 

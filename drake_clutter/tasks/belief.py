@@ -141,7 +141,7 @@ class Belief:
             felt = replace(self, touch={**self.touch, move.pick: product})
             return felt.record(move, result, X_TO_place)
         history = (*self.history, move)
-        if not result.was_executed:
+        if not result.was_executed or result is MoveResult.NOT_GRASPED:
             return replace(self, history=history, invalid_moves=(*self.invalid_moves, move))
         if not result.is_at_placement or X_TO_place is None:
             return replace(self, history=history, invalid_moves=())
