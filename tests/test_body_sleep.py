@@ -1,9 +1,11 @@
 """Body sleeping: which objects may move, and when."""
 
+import math
 from dataclasses import replace
 
 import pytest
 from conftest import DEFAULT_CELL, resting, scene_of
+from pydrake.math import RotationMatrix
 from test_clutter_station import HOME, TOOL, station_at_home
 
 from drake_clutter.grammar import Orientation
@@ -11,6 +13,7 @@ from drake_clutter.planning.motion_plan import DWELL_TIME
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.scenes.geometry import penetration_depth
 from drake_clutter.scenes.scene import Pose
 from drake_clutter.station.body_sleep import BodySleepManager, affected_bodies, bodies_to_wake
 from drake_clutter.station.command_schedule import build_command_schedule
@@ -45,6 +48,25 @@ def test_an_object_that_is_reached_late_in_a_descent_is_affected(plan: PickPlace
     by_step = {step.name: names for step, names in zip(plan.steps, affected, strict=True) if names}
     at_place = {PICKED.name, SUPPORT.name}
     assert by_step == {"grasp": {PICKED.name}, "descend": at_place, "release": at_place}
+
+
+@pytest.mark.parametrize(("gap", "is_affected"), [(0.005, False), (0.002, True)])
+def test_piles_are_affected_if_they_are_near_not_if_their_bounding_boxes_meet(
+    gap: float, is_affected: bool, plan: PickPlacePlan
+) -> None:
+    """A box turned by 45 deg stands beside the picked one, along the diagonal, under another."""
+    beside = resting("gelatin_box")
+    turned = RotationMatrix.MakeZRotation(math.pi / 4).matrix() @ beside.X_TO.rotation
+    distance = sum(PICKED.bounds_T[1][:2]) / math.sqrt(2) + beside.bounds_T[1][0] + gap
+    xy = distance / math.sqrt(2)
+    beside = replace(beside, X_TO=Pose.from_rotation(turned, (xy, xy, beside.X_TO.p[2])))
+    upper = resting("tomato_soup_can", xy=(xy, xy), floor=beside.top_height, name="upper")
+    assert penetration_depth(beside, PICKED) == pytest.approx(-gap, abs=1e-6)
+    assert (beside.bounds_T[0][:2] < PICKED.bounds_T[1][:2]).all(), "their bounding boxes overlap"
+    affected = affected_bodies([*SCENE.objects, beside, upper], plan)
+    grasp = next(k for k, step in enumerate(plan.steps) if step.name == "grasp")
+    near = {beside.name, upper.name} if is_affected else set()
+    assert affected[grasp] == {PICKED.name} | near
 
 
 def test_objects_are_woken_around_pick_and_place(plan: PickPlacePlan) -> None:

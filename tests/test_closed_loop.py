@@ -27,6 +27,7 @@ from drake_clutter.resources import resource_path
 from drake_clutter.scenes.interfaces import Move, MoveResult, Observation
 from drake_clutter.scenes.scene import Pose, Scene
 from drake_clutter.stability.ray_caster import RayCaster
+from drake_clutter.station import station_simulation
 from drake_clutter.station.messages import ExecutorStatus, PlannedMove, PlanRequest, PlanResponse
 from drake_clutter.systems import closed_loop
 from drake_clutter.systems.closed_loop import ClosedLoop
@@ -306,6 +307,24 @@ def test_a_closed_loop_episode_with_another_arm(
     assert samples is not None
     assert samples.q.shape[1] == joints
     assert samples.q[0] == pytest.approx(cell.robot.home, abs=1e-6)
+
+
+def test_a_motion_that_the_diagram_skips_ends_as_one_that_it_simulates(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scenario = Scenario(agent="largest-clear", max_moves=1)
+    skipped, timing = run_closed_loop(scenario, COVERED, lambda _: None)
+    monkeypatch.setattr(station_simulation, "MAX_COARSE_DISPLACEMENT", -1.0)
+    simulated, other_timing = run_closed_loop(scenario, COVERED, lambda _: None)
+    first, second = (task.transitions[0].outcome for task in (skipped, simulated))
+    assert first.result is second.result is MoveResult.PLACED
+    assert timing.simulated == pytest.approx(other_timing.simulated, abs=1e-9)
+    for name, X_TO in first.scene.poses.items():
+        assert X_TO.p == pytest.approx(second.scene.poses[name].p, abs=1e-3)
+    assert first.samples is not None
+    assert second.samples is not None
+    assert (first.samples.time_step, second.samples.time_step) == (0.005, 0.0025)
+    assert first.samples.q[-1] == pytest.approx(second.samples.q[-1], abs=1e-4)
 
 
 def test_the_last_allowed_move_can_reveal_all_objects(config: ClutterConfig) -> None:

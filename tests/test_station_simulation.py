@@ -30,12 +30,14 @@ from drake_clutter.scenes.action_samples import PHASES, ActionSamples
 from drake_clutter.scenes.scene import Pose
 from drake_clutter.simulation.scene_plant import pose_from_transform
 from drake_clutter.station.clutter_station import ClutterStation
+from drake_clutter.station.command_schedule import build_command_schedule
 from drake_clutter.station.messages import PlannedMove
 from drake_clutter.station.pick_place_executor import EXECUTOR_UPDATE_PERIOD
 from drake_clutter.station.station_simulation import (
     STEP_PERIOD,
     TIME_STEP,
     StationSimulation,
+    simulate_coarsely,
     simulate_plan,
 )
 
@@ -50,11 +52,14 @@ CELL = cell_with(
 """Cell whose base, tool and camera have other poses than in the default cell."""
 
 
+def planner_for(cell: WorkCell) -> PickPlacePlanner:
+    return PickPlacePlanner(cell, PlannerConfig(optimize=False))
+
+
 def planned(cell: WorkCell = CELL) -> PickPlacePlan:
     box = SCENE["pudding_box"].X_TO
     X_TO = Pose((0.0, -0.2, box.translation[2] + 0.001), box.quaternion)
-    planner = PickPlacePlanner(cell, PlannerConfig(optimize=False))
-    plan = planner.plan(SCENE.objects, "pudding_box", X_TO)
+    plan = planner_for(cell).plan(SCENE.objects, "pudding_box", X_TO)
     assert isinstance(plan, PickPlacePlan)
     return plan
 
@@ -324,6 +329,43 @@ def test_a_lost_object_is_simulated_with_all_objects_movable() -> None:
     result = simulate_plan(cell, SCENE, plan)
     assert result.lost_object
     assert result.poses == StationSimulation(cell, SCENE).execute(plan).poses
+
+
+def test_a_simulation_continues_at_the_end_of_a_motion_of_another_one() -> None:
+    plan, simulation = planned(), StationSimulation(CELL, SCENE, rate=40.0)
+    context = simulation.executor.GetMyMutableContextFromRoot(simulation.root)
+    port = simulation.executor.GetInputPort("plan")
+    simulation.step()
+    assert not simulation.has_just_started
+    port.FixValue(context, PlannedMove(7, plan))
+    simulation.step()
+    assert simulation.has_just_started
+    motion = simulate_coarsely(CELL, SCENE, plan)
+    motion.execute(plan)
+    simulation.take_over(motion)
+    duration = build_command_schedule(plan, CELL).end_time
+    start = 2 * STEP_PERIOD
+    assert simulation.executor_state.start_time == pytest.approx(start)
+    assert 0 <= start + duration - simulation.root.get_time() < STEP_PERIOD
+    simulation.step()
+    assert simulation.finished_plan == 7
+    joints = motion.station.joint_positions(motion.plant_context)
+    for _ in range(2):  # also after a step
+        context = simulation.plant_context
+        assert simulation.station.joint_positions(context) == pytest.approx(joints, abs=1e-5)
+        for name, X_TO in motion.scene.poses.items():
+            assert simulation.scene.poses[name].p == pytest.approx(X_TO.p, abs=1e-9)
+        simulation.step()
+    simulation.run_until(lambda: simulation.is_at_rest)
+    assert simulation.recorded_samples() is None
+    back = planner_for(CELL).plan(
+        simulation.scene.objects, "pudding_box", SCENE["pudding_box"].X_TO
+    )
+    assert isinstance(back, PickPlacePlan)
+    returned = simulation.execute(back)
+    assert returned.poses["pudding_box"].p == pytest.approx(SCENE["pudding_box"].X_TO.p, abs=1e-3)
+    assert returned.samples is not None
+    assert returned.samples.time[-1] < build_command_schedule(back, CELL).end_time + 0.2
 
 
 def test_a_released_simulation_leaves_no_memory_behind() -> None:

@@ -7,13 +7,14 @@ from collections import deque
 from collections.abc import Sequence, Set
 from dataclasses import replace
 
+import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import CollisionFilterDeclaration, FilterId, GeometrySet
 from pydrake.systems.framework import Context
 
 from drake_clutter.planning.motion_plan import Plan
-from drake_clutter.scenes.geometry import group_touching_objects, transport_pose
+from drake_clutter.scenes.geometry import penetration_depth, transport_pose
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.drake_judge import TOUCHING_MARGIN
 from drake_clutter.simulation.scene_plant import get_support_body
@@ -23,6 +24,11 @@ from drake_clutter.station.gripper_actuator import GraspStatus
 
 Floats = NDArray[np.float64]
 
+CONTACT_MARGIN = 0.001
+"""Objects at rest that are farther apart than this do not touch [m].
+
+What is hit although it was not expected to be is woken when it is hit.
+"""
 WAKE_BEFORE_CONTACT = 0.05
 """Time before the gripper grasps or releases an object at which its neighbors are woken [s]; two
 steps of the simulation."""
@@ -39,7 +45,7 @@ def nearest_object(objects: Sequence[SceneObject], X_TO: Pose) -> SceneObject:
 def affected_bodies(objects: Sequence[SceneObject], plan: Plan) -> tuple[frozenset[str], ...]:
     """Return the names of the objects that each step of a plan may disturb.
 
-    These are the stacks that touch the object that is grasped or released. Poses of the plan may be
+    These are the piles that touch the object that is grasped or released. Poses of the plan may be
     estimates: the object is the one closest to its pose at the start of the plan.
 
     Args:
@@ -71,21 +77,40 @@ def affected_bodies(objects: Sequence[SceneObject], plan: Plan) -> tuple[frozens
 
 
 def _names_near(copies: Sequence[SceneObject], objects: Sequence[SceneObject]) -> frozenset[str]:
-    """Return the names of the stacks that an object touches at one of its poses.
+    """Return the names of the piles that an object touches at one of its poses.
 
     Args:
         copies: The object at these poses.
         objects: All objects.
     """
     name = copies[0].name
+    piles = nx.Graph()
+    piles.add_nodes_from(o.name for o in objects)
+    piles.add_edges_from(
+        (a.name, b.name) for a, b in _pairs_within(objects, objects, CONTACT_MARGIN)
+    )
+    others = [o for o in objects if o.name != name]
+    touched = {o.name for _, o in _pairs_within(copies, others, TOUCHING_MARGIN)}
+    return frozenset({name}).union(*(nx.node_connected_component(piles, o) for o in touched))
 
-    def touches_copy(o: SceneObject) -> bool:
-        pairs = (group_touching_objects([copy, o], TOUCHING_MARGIN) for copy in copies)
-        return o.name != name and any(len(pair) == 1 for pair in pairs)
 
-    groups = group_touching_objects(objects, TOUCHING_MARGIN)
-    near = (o.name for group in groups if any(touches_copy(o) for o in group) for o in group)
-    return frozenset({name, *near})
+def _pairs_within(
+    first: Sequence[SceneObject], second: Sequence[SceneObject], distance: float
+) -> list[tuple[SceneObject, SceneObject]]:
+    """Return the pairs of objects that are at most a distance apart [m]; each pair once."""
+    if not first or not second:
+        return []
+    lower_a, upper_a = (
+        np.array(bounds) for bounds in zip(*(o.bounds_T for o in first), strict=True)
+    )
+    lower_b, upper_b = (
+        np.array(bounds) for bounds in zip(*(o.bounds_T for o in second), strict=True)
+    )
+    gaps = np.maximum(lower_a[:, None] - upper_b, lower_b - upper_a[:, None]).max(axis=2)
+    pairs = [(first[i], second[j]) for i, j in np.argwhere(gaps <= distance).tolist()]
+    if first is second:
+        pairs = [(a, b) for a, b in pairs if a.name < b.name]
+    return [(a, b) for a, b in pairs if penetration_depth(a, b) >= -distance]
 
 
 def bodies_to_wake(

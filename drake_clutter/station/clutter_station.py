@@ -235,6 +235,33 @@ class ClutterStation(Diagram):
             else:
                 self.plant.SetFreeBodyPose(context, self.scene_plant.bodies[o.name], X_TO)
 
+    def copy_state(self, root: Context, other: "ClutterStation", other_root: Context) -> None:
+        """Set the state of arm, gripper, vacuum and objects to that of another station.
+
+        Objects are at rest afterwards, and none is attached.
+
+        Args:
+            root: Context of the root diagram.
+            other: Station with the same cell, in which some of the objects may be fixed.
+            other_root: Context of its root diagram.
+        """
+        context, source = self.plant_context(root), other.plant_context(other_root)
+        for target, instance in (
+            (self.arm.robot, other.arm.robot),
+            (self.arm.gripper, other.arm.gripper),
+        ):
+            self.plant.SetPositions(context, target, other.plant.GetPositions(source, instance))
+            self.plant.SetVelocities(context, target, other.plant.GetVelocities(source, instance))
+        for name, body in other.scene_plant.bodies.items():
+            X_TO = body.EvalPoseInWorld(source)
+            self.plant.SetFreeBodyPose(context, self.scene_plant.bodies[name], X_TO)
+        if self.vacuum_system is not None:
+            assert other.vacuum_system is not None
+            vacuum_context = self.vacuum_system.GetMyMutableContextFromRoot(root)
+            vacuum_context.SetStateAndParametersFrom(
+                other.vacuum_system.GetMyContextFromRoot(other_root)
+            )
+
     def joint_positions(self, context: Context) -> Floats:
         """Return the joint positions of the arm [rad]. Shape (n,).
 

@@ -134,6 +134,11 @@ class MotionRecorder:
         self._rows = list[_Row]()
         self._states = list[tuple[float, ExecutorState]]()
 
+    def skip(self, number: int) -> None:
+        """Forget what was recorded, and do not record the plan of a number."""
+        self._number = number
+        self.clear()
+
     def observe(self, root: Context) -> EventStatus:
         """Record the plant if its state is that of the current time and a sample needs it.
 

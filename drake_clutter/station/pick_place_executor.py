@@ -85,15 +85,20 @@ class ExecutorState(Message):
         assert self.schedule is not None
         return min(time - self.start_time - self.waited, self.schedule.end_time)
 
+    @property
+    def end_time(self) -> float:
+        """Time at which the plan ends [s]; -infinity without a plan."""
+        if self.schedule is None:
+            return -math.inf
+        return self.start_time + self.waited + self.schedule.end_time
+
     def has_ended(self, time: float) -> bool:
         """Return whether no plan is executed.
 
         Args:
             time: Simulation time [s].
         """
-        if self.schedule is None:
-            return True
-        return time >= self.start_time + self.waited + self.schedule.end_time
+        return time >= self.end_time
 
 
 class PickPlaceExecutor(LeafSystem):
@@ -188,6 +193,10 @@ class PickPlaceExecutor(LeafSystem):
         """Return the state from the context of the executor."""
         state: ExecutorState = context.get_abstract_state(self._state).get_value()
         return state
+
+    def set_state(self, context: Context, state: ExecutorState) -> None:
+        """Set the state in the context of the executor."""
+        context.SetAbstractState(int(self._state), state)
 
     def _update(self, context: Context, state: State) -> EventStatus:
         current = self.state(context)

@@ -9,12 +9,12 @@ result = simulation.execute(plan)
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.analysis import Simulator
+from pydrake.systems.analysis import InitializeParams, Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from drake_clutter.cell.work_cell import WorkCell
@@ -23,7 +23,7 @@ from drake_clutter.limits import MAX_MOTION_DURATION
 from drake_clutter.planning.motion_plan import HeldObject, Plan
 from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
 from drake_clutter.scenes.action_samples import ActionSamples
-from drake_clutter.scenes.scene import Pose, Scene, tilt_between
+from drake_clutter.scenes.scene import Pose, Scene, SceneObject, tilt_between
 from drake_clutter.station.body_sleep import BodySleepManager, affected_bodies, bodies_to_wake
 from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.command_schedule import CommandSchedule, RecordedSchedule
@@ -307,11 +307,12 @@ class StationSimulation:
     @property
     def is_at_rest(self) -> bool:
         """Whether no plan is executed, and none was within `SETTLE_TIME`."""
-        state = self.executor_state
-        if state.schedule is None:
-            return True
-        end = state.start_time + state.waited + state.schedule.end_time
-        return self._num_steps * STEP_PERIOD >= end + SETTLE_TIME
+        return self._num_steps * STEP_PERIOD >= self.executor_state.end_time + SETTLE_TIME
+
+    @property
+    def is_asleep(self) -> bool:
+        """Whether all objects are locked, see `BodySleepManager`."""
+        return not self._sleep.awake
 
     def step(self) -> None:
         """Advance by `STEP_PERIOD`."""
@@ -364,6 +365,40 @@ class StationSimulation:
             InputError: The plan does not start at the commanded joint positions, is longer than
                 `MAX_MOTION_DURATION`, or a step names an unknown tool.
         """
+        before = self.scene
+        max_tracking_error = 0.0
+        for error in self._execute(plan, schedule):
+            max_tracking_error = max(max_tracking_error, error)
+        return self._result(plan, _moved_objects(plan), before, max_tracking_error)
+
+    def execute_while_uneventful(
+        self, plan: Plan, expect: Callable[[], Sequence[SceneObject]] | None = None
+    ) -> PickPlaceResult | None:
+        """Execute a plan as `execute` does, until something unexpected happens.
+
+        Args:
+            plan: Plan to execute.
+            expect: Returns, after the motion, the moved objects at the poses at which they should
+                be; None for those of the plan, whose objects must be those of the scene.
+
+        Returns:
+            The result; None if the move is not uneventful, or a fixed object was hit.
+        """
+        before = self.scene
+        max_tracking_error = 0.0
+        for error in self._execute(plan):
+            max_tracking_error = max(max_tracking_error, error)
+            if self._sleep.woken_fixed_objects or self._has_displaced_objects(before):
+                return None
+        moved = _moved_objects(plan) if expect is None else expect()
+        result = self._result(plan, moved, before, max_tracking_error)
+        return result if result.is_uneventful else None
+
+    def _execute(self, plan: Plan, schedule: CommandSchedule | None = None) -> Iterator[float]:
+        """Execute a plan, and yield the tracking error after each step [rad].
+
+        It is given up `MAX_OVERTIME` after its duration.
+        """
         self._check_start(plan)
         steps = plan.steps
         duration = sum(s.duration for s in steps) if schedule is None else schedule.end_time
@@ -371,19 +406,63 @@ class StationSimulation:
             allowed = f"at most {MAX_MOTION_DURATION:g} s"
             raise InputError(f"plan: takes {duration:g} s; expected {allowed}")
         last_step = self._num_steps + math.ceil((duration + MAX_OVERTIME) / STEP_PERIOD)
-        before = self.scene
         number = self.executor_state.number + 1
         context = self.executor.GetMyMutableContextFromRoot(self.root)
         self.executor.GetInputPort("plan").FixValue(context, PlannedMove(number, plan, schedule))
-        max_tracking_error = 0.0
         if self.recorder is not None:
             self.recorder.clear()
         while self.finished_plan != number or not self.is_at_rest:
             if self._num_steps >= last_step:
-                return replace(self._result(plan, before, max_tracking_error), has_ended=False)
+                return
             self.step()
-            max_tracking_error = max(max_tracking_error, self._tracking_error())
-        return self._result(plan, before, max_tracking_error)
+            yield self._tracking_error()
+
+    def _has_displaced_objects(self, before: Scene) -> bool:
+        """Return whether an awake object that was not held has moved too far.
+
+        Args:
+            before: Scene before the motion.
+        """
+        names = self._sleep.awake - {self.gripper.status.last_held}
+        positions = self.station.scene_plant.positions(self.plant_context, names)
+        distances = (np.linalg.norm(p - before[name].X_TO.p) for name, p in positions.items())
+        return any(distance > MAX_COARSE_DISPLACEMENT for distance in distances)
+
+    @property
+    def has_just_started(self) -> bool:
+        """Whether a plan has started at the end of the last step, with all objects asleep."""
+        state = self.executor_state
+        age = self._num_steps * STEP_PERIOD - state.start_time
+        return state.plan is not None and abs(age) < _TIME_MARGIN and not self._sleep.awake
+
+    def take_over(self, other: "StationSimulation") -> None:
+        """Continue at the end of the plan that has just started, which another one has executed.
+
+        All objects must be asleep in both simulations, and none held.
+
+        Args:
+            other: Simulation with the same cell and objects, whose only plan started at time 0 from
+                the state of this one.
+        """
+        assert self.has_just_started
+        assert other.is_asleep
+        root, state = self.root, self.executor_state
+        executed = replace(
+            other.executor_state,
+            number=state.number,
+            start_time=state.start_time + other.executor_state.start_time,
+        )
+        self.executor.set_state(self.executor.GetMyMutableContextFromRoot(root), executed)
+        self.station.copy_state(root, other.station, other.root)
+        self.gripper.status = other.gripper.status
+        self._affected_plan = state.number
+        self._affected = other._affected
+        # The step before the end, so that all systems notice the end when they would.
+        self._num_steps = math.ceil(executed.end_time / STEP_PERIOD) - 1
+        root.SetTime(self._num_steps * STEP_PERIOD + _TIME_MARGIN)
+        self.simulator.Initialize(InitializeParams(suppress_initialization_events=True))
+        if self.recorder is not None:
+            self.recorder.skip(state.number)
 
     def _check_start(self, plan: Plan) -> None:
         """Raise an error unless a plan starts at the commanded joints and names known tools."""
@@ -405,14 +484,13 @@ class StationSimulation:
     def _result(
         self,
         plan: Plan,
+        moved: Sequence[SceneObject],
         before: Scene,
         max_tracking_error: float,
     ) -> PickPlaceResult:
         poses = self._poses()
         status = self.gripper.status
-        held = {state.held.name for state in (plan.start, plan.end) if state.held}
-        names = {step.object_name for step in plan.steps if step.object_name} | held
-        moved = [o for o in plan.end.objects if o.name in names]
+        names = {o.name for o in moved}
         return PickPlaceResult(
             plan=plan,
             poses=poses,
@@ -437,6 +515,7 @@ class StationSimulation:
             simulated_time=self.root.get_time(),
             samples=self.recorded_samples(),
             has_no_seal=self.executor_state.has_no_seal,
+            has_ended=self.finished_plan == self.executor_state.number and self.is_at_rest,
         )
 
     def recorded_samples(self) -> ActionSamples | None:
@@ -496,6 +575,30 @@ def execute_grips(
     return replace(result, num_grips=len(tried))
 
 
+def _moved_objects(plan: Plan) -> list[SceneObject]:
+    """Return the objects that a plan moves, at their poses at its end."""
+    held = {state.held.name for state in (plan.start, plan.end) if state.held}
+    names = {step.object_name for step in plan.steps if step.object_name} | held
+    return [o for o in plan.end.objects if o.name in names]
+
+
+def simulate_coarsely(
+    cell: WorkCell, scene: Scene, plan: Plan, *, rate: float | None = None
+) -> StationSimulation:
+    """Return a simulation of its own for a plan in which nothing unexpected should happen.
+
+    The time step is `COARSE_TIME_STEP`, and only the objects that the plan may disturb can move.
+
+    Args:
+        cell: Work cell; its support is replaced by that of the scene.
+        scene: Objects at rest.
+        plan: Plan that is to be executed.
+        rate: Samples per second [Hz]; None records nothing.
+    """
+    affected = frozenset[str]().union(*affected_bodies(scene.objects, plan))
+    return StationSimulation(cell, scene, movable=affected, time_step=COARSE_TIME_STEP, rate=rate)
+
+
 def simulate_plan(
     cell: WorkCell,
     scene: Scene,
@@ -507,9 +610,8 @@ def simulate_plan(
 ) -> PickPlaceResult:
     """Execute a plan in a simulation of its own.
 
-    At first the time step is `COARSE_TIME_STEP`, and only the objects that the plan may disturb
-    can move. If the move is not uneventful, or one of the other objects is hit, it is simulated
-    again with `TIME_STEP` and all objects movable.
+    At first it is simulated coarsely, see `simulate_coarsely`. If the move is not uneventful, or
+    one of the fixed objects is hit, it is simulated again with `TIME_STEP` and all objects movable.
 
     Args:
         cell: Work cell; its support is replaced by that of the scene.
@@ -519,13 +621,11 @@ def simulate_plan(
         regrip: See `execute_grips`.
         max_grips: See `execute_grips`.
     """
-    affected = frozenset[str]().union(*affected_bodies(scene.objects, plan))
-    coarse = StationSimulation(cell, scene, movable=affected, time_step=COARSE_TIME_STEP, rate=rate)
-    result = execute_grips(coarse, plan, regrip, max_grips)
-    is_accepted = result.is_uneventful and not coarse.woken_fixed_objects
+    coarse = simulate_coarsely(cell, scene, plan, rate=rate)
+    coarse_result = coarse.execute_while_uneventful(plan)
     coarse.release()
-    if is_accepted:
-        return result
+    if coarse_result is not None:
+        return coarse_result
     fine = StationSimulation(cell, scene, rate=rate)
     result = execute_grips(fine, plan, regrip, max_grips)
     fine.release()

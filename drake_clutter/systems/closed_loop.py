@@ -30,7 +30,7 @@ from drake_clutter.station.body_sleep import nearest_object
 from drake_clutter.station.clutter_station import ClutterStation
 from drake_clutter.station.messages import PlanResponse
 from drake_clutter.station.pick_place_executor import PickPlaceExecutor
-from drake_clutter.station.station_simulation import StationSimulation
+from drake_clutter.station.station_simulation import StationSimulation, simulate_coarsely
 from drake_clutter.systems.action_filter import InfeasibleMoveFilter
 from drake_clutter.systems.perception_system import (
     LabelPerception,
@@ -113,6 +113,7 @@ class ClosedLoop:
         """
         self.scene = scene
         self._perceive = perceive
+        self._rate = rate
         config = replace(config, cell=config.cell.with_support(scene.support))
         self._config = config if perceive is None else with_image_tolerances(config)
         self._detector = LabelDetector(config.cell.camera)
@@ -200,8 +201,7 @@ class ClosedLoop:
         samples: ActionSamples | None = None
         state = self._state
         while state.phase is not PolicyPhase.DONE:
-            self.simulation.step()
-            samples = self._take_samples() or samples
+            samples = self._advance() or samples
             previous, state = state, self._state
             is_done = state.phase is PolicyPhase.DONE
             # A request for another grasp follows from the same decision.
@@ -211,6 +211,29 @@ class ClosedLoop:
                 samples = None
         assert state.decision is not None
         return state.decision
+
+    def _advance(self) -> ActionSamples | None:
+        """Advance by a step or over a whole motion; return the samples of one that has ended.
+
+        A motion is simulated coarsely at first, in a simulation of its own. If it is uneventful,
+        the diagram continues at its end. Otherwise, the diagram simulates it.
+        """
+        simulation = self.simulation
+        plan = simulation.executor_state.plan
+        if isinstance(plan, PickPlacePlan) and simulation.has_just_started:
+            motion = simulate_coarsely(simulation.cell, simulation.scene, plan, rate=self._rate)
+            result = motion.execute_while_uneventful(
+                plan, lambda: [self._expected_object(plan, motion)]
+            )
+            if not motion.is_asleep:
+                result = None
+            if result is not None:
+                simulation.take_over(motion)
+            motion.release()
+            if result is not None:
+                return result.samples
+        simulation.step()
+        return self._take_samples()
 
     def _take_samples(self) -> ActionSamples | None:
         """Return the samples of a motion that has ended; None if none has, or without a rate."""
@@ -260,18 +283,30 @@ class ClosedLoop:
             decision, replace(outcome, scene=self.scene, samples=samples), self.perception
         )
 
+    def _expected_object(self, plan: PickPlacePlan, simulation: StationSimulation) -> SceneObject:
+        """Return the object that a simulation has picked, at the pose at which it should be.
+
+        Args:
+            plan: Plan that was executed.
+            simulation: Simulation that has executed it from `scene`.
+        """
+        before = self.scene
+        # The object on the cup may differ from the object that the policy meant to pick.
+        last_held = simulation.gripper.status.last_held
+        name = last_held or nearest_object(before.objects, plan.X_TO_pick).name
+        # The detected pose may differ from the true one by an error or by a symmetry, and the
+        # object is placed with the same difference.
+        X_TO_place = transport_pose(plan.X_TO_pick, plan.X_TO_place, before[name].X_TO)
+        lowered_distance = simulation.executor_state.lowered_distance
+        return replace(before[name], X_TO=X_TO_place.translated((0.0, 0.0, -lowered_distance)))
+
     def _outcome(self, plan: PickPlacePlan) -> tuple[str, Outcome]:
         """Return the name of the object that was picked, and the outcome of its move."""
         before = self.scene
         after = self.simulation.scene
         grasp = self.simulation.gripper.status
-        # The object on the cup may differ from the object that the policy meant to pick.
-        picked = grasp.last_held or nearest_object(before.objects, plan.X_TO_pick).name
-        # The detected pose may differ from the true one by an error or by a symmetry, and the
-        # object is placed with the same difference.
-        lowered_distance = self.simulation.executor_state.lowered_distance
-        X_TO_place = transport_pose(plan.X_TO_pick, plan.X_TO_place, before[picked].X_TO)
-        X_TO_place = X_TO_place.translated((0.0, 0.0, -lowered_distance))
+        expected = self._expected_object(plan, self.simulation)
+        picked, X_TO_place = expected.name, expected.X_TO
         lost_object = not grasp.has_held or grasp.lost_object
         outcome = evaluate_outcome(
             before, after, picked, X_TO_place, lost_object, self._config.settle
