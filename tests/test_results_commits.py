@@ -8,7 +8,13 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-FOLDERS = ("benchmarks/results", "training/results", "training/scenes", "training/checkpoints")
+FOLDERS = (
+    "benchmarks/results",
+    "training/results",
+    "training/scenes",
+    "training/targets",
+    "training/checkpoints",
+)
 COMMIT = re.compile(rb'"commit": *"([0-9a-f]{7,40})(?:-dirty)?"')
 NOT_IN_HISTORY = {"788e581": "training/results/second_trainings.json"}
 """Commits that the repository lacks, and the results file that says so."""

@@ -10,6 +10,7 @@ from conftest import CATALOG, CLASSES, DEFAULT_CELL, WORLD, random_scene, restin
 from gymnasium.utils.env_checker import check_env
 
 from drake_clutter.agents.area_reduction import uncovered_areas
+from drake_clutter.agents.episode_evaluation import EpisodeResult
 from drake_clutter.agents.explorer_network import ExplorerNetwork, collate_graphs, sample_actions
 from drake_clutter.agents.explorers import make_policy_factory
 from drake_clutter.agents.learned_explorer import (
@@ -23,7 +24,7 @@ from drake_clutter.grammar import Orientation
 from drake_clutter.learning.checkpoint import load_checkpoint, save_checkpoint
 from drake_clutter.scenes.interfaces import Move, MoveResult, PickPlaceCommand
 from drake_clutter.scenes.scene import SceneObject
-from drake_clutter.scenes.scene_dataset import SceneDataset, SceneRecord
+from drake_clutter.scenes.scene_dataset import SceneDataset, SceneRecord, load_scene_dataset
 from drake_clutter.simulation.settle_executor import SettleExecutor
 from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.tasks.belief import Decision
@@ -32,6 +33,9 @@ from drake_clutter.tasks.episode import make_teleport_backend_factory, run_episo
 from drake_clutter.tasks.exploration_task import TerminationReason
 from drake_clutter.tasks.oracle_search import OracleSearch, Solvability
 from drake_clutter.tasks.search_target import RANDOM_HIDDEN, find_target, require_target
+from training import evaluate_target_search as evaluation
+from training.script import SCENES
+from training.target_set import TARGETS, TargetPair, TargetSet, load_target_set
 
 JUDGE = StaticStabilityJudge(WORLD)
 SEARCH = OracleSearch(WORLD, JUDGE)
@@ -294,3 +298,56 @@ def test_the_arm_plans_and_hands_over() -> None:
     place = DEFAULT_CELL.handover
     assert place is not None
     assert task.scene["target"].X_TO.p[:2] == pytest.approx(place.translation[:2], abs=0.002)
+
+
+SETS = sorted(TARGETS.glob("*.json"))
+
+
+@pytest.mark.parametrize("path", SETS, ids=[path.stem for path in SETS])
+def test_shipped_target_sets(path: Path, tmp_path: Path) -> None:
+    """The target of the first pair is hidden, and the oracle finds the stored number of moves."""
+    scenes = load_scene_dataset(SCENES / path.name, CATALOG)
+    targets = load_target_set(path, scenes)
+    assert [pair.scene for pair in targets.pairs] == list(range(len(scenes.scenes)))
+    pair = targets.pairs[0]
+    scene = scenes.settled_scene(pair.scene, scenes.grammar, WORLD)
+    observation, _ = JUDGE.ray_caster.observe(scene)
+    assert pair.target in {*scene.names} - {d.name for d in observation.detections}
+    plan = SEARCH.solve(scene, seed=pair.scene, targets=[pair.target]).plan
+    assert (len(plan) or None) == pair.moves
+    changed = tmp_path / path.name
+    changed.write_text(path.read_text().replace(f'"moves": {pair.moves}', '"moves": 17', 1))
+    with pytest.raises(InputError, match="sha256: does not match the pairs"):
+        load_target_set(changed, scenes)
+    with pytest.raises(InputError, match="scenes_sha256: is that of other scenes than few"):
+        load_target_set(path, SceneDataset("few", (), {}, (), "", DEFAULT_CELL))
+
+
+def result(ended: str, moves: int) -> EpisodeResult:
+    return EpisodeResult("scene", "agent", ended, 1, 1, moves, (0,) * moves, 0)
+
+
+def test_metrics_of_a_search() -> None:
+    """Three solvable pairs, one of which is revealed late and one not at all, and another one."""
+    pairs = [
+        TargetPair(scene=k, target="a", solvable=solvable, moves=moves, is_optimal=True)
+        for k, (solvable, moves) in enumerate(
+            [("solvable", 4), ("solvable", 2), ("solvable", 3), ("undecided", None)]
+        )
+    ]
+    targets = TargetSet("set", "scenes", tuple(pairs), "")
+    ours = [
+        result("target found", 5),  # 1.25 times the oracle's
+        result("target found", 3),
+        result("collapsed", 1),
+        result("target found", 8),
+    ]
+    area = [result("target found", 10), result("out of moves", 20), result("target found", 3)]
+    row = evaluation.summarize(targets, ours, area)
+    assert (row["episodes"], row["revealed"], row["collapsed"]) == (4, 0.75, 0.25)
+    assert row["moves"] == pytest.approx(16 / 3)
+    solvable = row["solvable"]
+    assert (solvable["episodes"], solvable["oracle_moves"]) == (3, 3.0)
+    assert (solvable["revealed"], solvable["efficient"]) == (2 / 3, 1 / 3)
+    assert (row["to_oracle"]["ratio"], row["to_oracle"]["episodes"]) == (8 / 6, 2)
+    assert (row["to_area"]["ratio"], row["to_area"]["episodes"]) == (0.5, 1)
