@@ -19,6 +19,8 @@ from typing import Any
 MAX_MESSAGE_LENGTH = 300
 """Largest number of characters of a message after the name of its file; the rest is cut."""
 
+INTERRUPTION = "interrupted; finished results are kept"
+"""What an interrupted program prints."""
 _INTERRUPTED = 130
 """Exit code of an interrupted program, 128 + SIGINT."""
 _STORAGE_ERRORS = frozenset(
@@ -256,7 +258,7 @@ def cli_error_handler() -> Iterator[None]:
 
 
 def _print_interruption() -> None:
-    print("interrupted; finished results are kept", file=sys.stderr)
+    print(INTERRUPTION, file=sys.stderr)
 
 
 def temporary_path(path: Path) -> Path:
@@ -305,6 +307,19 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
+def temporary_folder() -> Path:
+    """Return the folder for temporary files.
+
+    Raises:
+        InputError: None can be written.
+    """
+    try:
+        return Path(tempfile.gettempdir())
+    except FileNotFoundError as error:
+        remedy = "set TMPDIR to a folder that can be written"
+        raise input_error("temporary files", f"{error.strerror}; {remedy}") from error
+
+
 def private_temporary_folder(purpose: str) -> Path:
     """Return a folder for temporary files that later runs of the same user find again.
 
@@ -313,8 +328,11 @@ def private_temporary_folder(purpose: str) -> Path:
 
     Args:
         purpose: Part of the folder's name.
+
+    Raises:
+        InputError: No folder for temporary files can be written.
     """
-    folder = Path(tempfile.gettempdir()) / f"drake_clutter_{purpose}_{os.getuid()}"
+    folder = temporary_folder() / f"drake_clutter_{purpose}_{os.getuid()}"
     with suppress(FileExistsError):
         folder.mkdir(mode=0o700)
     status = folder.lstat()

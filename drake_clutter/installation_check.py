@@ -6,6 +6,7 @@ library is a result of the check.
 
 import os
 import platform
+import re
 import signal
 import subprocess
 import sys
@@ -17,6 +18,12 @@ _PROBE_TIMEOUT = 120.0
 """Time limit of a probe; the first rendering on a machine compiles shaders [s]."""
 _MIN_MEMORY = 4.0
 """Memory that one worker process may need [GiB]."""
+
+
+_EXPECTED_ERROR = re.compile(
+    r"^drake_clutter\.(installation_check\.ProbeError|files\.InputError): "
+)
+"""Types of errors whose message is enough."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +56,7 @@ def run_checks() -> list[Check]:
         _run_probe(
             probe_rendering, "on Debian: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"
         ),
+        _run_probe(probe_temporary, "set TMPDIR to a folder that can be written"),
         _run_probe(probe_compilation, "set NUMBA_CACHE_DIR to a folder that can be written"),
         _run_probe(probe_solvers, "install Drake's own wheel: pip install --force-reinstall drake"),
         _check_torch(),
@@ -114,6 +122,13 @@ def probe_rendering() -> str:
     if abs(depth - 2.0) > 0.001:
         raise ProbeError(f"a face at a depth of 2 m is rendered at {depth:g} m")
     return "VTK over EGL renders"
+
+
+def probe_temporary() -> str:
+    """Return the folder for temporary files."""
+    from drake_clutter.files import temporary_folder
+
+    return f"temporary files are written to {temporary_folder()}"
 
 
 def probe_compilation() -> str:
@@ -213,12 +228,7 @@ def _run_probe(probe: Callable[[], str], remedy: str) -> Check:
         signal_name = signal.Signals(-process.returncode).name
         detail = f"died of {signal_name} {_last_line(process.stderr)}".rstrip()
         return Check(name, False, detail, remedy)
-    return Check(
-        name,
-        False,
-        _last_line(process.stderr).removeprefix(f"{__name__}.{ProbeError.__name__}: "),
-        remedy,
-    )
+    return Check(name, False, _EXPECTED_ERROR.sub("", _last_line(process.stderr)), remedy)
 
 
 def _last_line(text: str) -> str:

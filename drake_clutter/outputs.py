@@ -88,11 +88,12 @@ def find_result(folder: Path, ignored: Iterable[str] = ()) -> Path | None:
 
 
 @contextmanager
-def output_file(path: Path) -> Iterator[Path]:
+def output_file(path: Path, option: str = "--out") -> Iterator[Path]:
     """Lock an output file, and remove the temporary files of killed runs.
 
     Args:
         path: The file; its folder is created if it does not exist.
+        option: Option that names the file, for messages.
 
     Yields:
         The file.
@@ -103,15 +104,15 @@ def output_file(path: Path) -> Iterator[Path]:
     """
     expected = "give a file in a writable folder"
     if path.is_dir():
-        raise InputError(f"--out {path}: is a folder; {expected}")
+        raise InputError(f"{option} {path}: is a folder; {expected}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(
-            f"--out {path}: cannot be written ({error.strerror}); {expected}"
+            f"{option} {path}: cannot be written ({error.strerror}); {expected}"
         ) from error
     if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise InputError(f"--out {path}: its folder is not writable; {expected}")
+        raise InputError(f"{option} {path}: its folder is not writable; {expected}")
     with _lock(path.with_name(f".{path.name}{_LOCK_SUFFIX}"), path):
         _remove_leftovers(path.parent, path)
         yield path

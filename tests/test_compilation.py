@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -83,6 +84,43 @@ def test_functions_are_cached_in_a_temporary_folder_without_a_home(copy: Path) -
     assert Path(cache).is_relative_to(variable)
     assert Path(variable).stat().st_mode & 0o777 == 0o700
     assert run_in(copy) == (cache, variable)
+
+
+READ_ONLY = """
+set -e
+awk '{print $2}' /proc/self/mounts | grep -Ev '^/(proc|sys|dev$|dev/pts)' | sort -u |
+    while read folder; do mount -o remount,bind,ro "$folder"; done
+for folder in . /tmp /var/tmp; do test ! -w "$folder"; done
+"""
+"""Script that makes every file system of its namespace read-only."""
+UNWRITABLE = """
+import sys
+from drake_clutter import installation_check
+print(installation_check._run_probe(installation_check.probe_temporary, "remedy").detail)
+from drake_clutter.cli import main
+sys.argv = ["drake-clutter", "view", "scene.yaml"]
+main()
+"""
+
+
+def test_a_machine_without_a_writable_folder_is_reported_in_one_line() -> None:
+    namespace = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c"]
+    try:
+        subprocess.run([*namespace, READ_ONLY], check=True, capture_output=True)
+    except (FileNotFoundError, subprocess.CalledProcessError):
+        pytest.skip("this process may not make file systems read-only for itself")
+    program = [sys.executable, "-c", UNWRITABLE]
+    result = subprocess.run(
+        [*namespace, f'{READ_ONLY} exec "$@"', "sh", *program], capture_output=True, text=True
+    )
+    assert result.returncode == 2, result.stderr
+    (line,) = result.stderr.splitlines()
+    assert re.fullmatch(
+        r"error temporary files: No usable temporary directory found in .*'/tmp'.*; "
+        r"set TMPDIR to a folder that can be written",
+        line,
+    )
+    assert result.stdout.strip() == line.removeprefix("error ")
 
 
 def test_a_temporary_folder_of_someone_else_is_not_used(

@@ -32,6 +32,7 @@ from recorded_episodes import synthetic_episode
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from test_collision_filters import arm
+from test_inverse_reachability import Arm, disk_map, move_rows, reaches
 from test_mesh_file import write_cube_with_seams
 from test_scene_file import DOCUMENT
 from test_scene_file_fuzzed import SCENARIO, places
@@ -54,10 +55,21 @@ from drake_clutter.assets.mesh_appearance import textured_parts
 from drake_clutter.assets.textured_mesh import gltf_text
 from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.work_cell import load_cell
+from drake_clutter.commands.explore_scene import read_moves
 from drake_clutter.commands.feasibility_parts import PartKind, StudyPart, load_part
 from drake_clutter.commands.generate_scenes import read_generation_progress
+from drake_clutter.commands.inspect_dataset import (
+    describe_inspection,
+    inspect_files,
+    inspection_document,
+)
 from drake_clutter.commands.job_file import JOB_FILE, open_job_folder
+from drake_clutter.commands.record_dataset import read_summary, summarize_dataset
 from drake_clutter.config import ClutterConfig, ExplorationConfig, upgrade_config
+from drake_clutter.feasibility.inverse_reachability import (
+    load_inverse_reachability,
+    save_inverse_reachability,
+)
 from drake_clutter.feasibility.move_study import MoveRecord
 from drake_clutter.feasibility.pose_noise import NoiseRecord
 from drake_clutter.feasibility.sequences import SequenceRecord
@@ -77,7 +89,13 @@ from drake_clutter.perception.image_dataset import (
 )
 from drake_clutter.perception.segmentation import CHECKPOINT_KIND, SegmentationNetwork
 from drake_clutter.planning.collision_model import CollisionModel
+from drake_clutter.recording.dataset_check import find_episode_files
 from drake_clutter.recording.hdf5_file import load_episode, save_episode
+from drake_clutter.recording.randomization import (
+    RANDOMIZATION_GROUPS,
+    RandomizationConfig,
+    load_randomization,
+)
 from drake_clutter.records import read_jsonl, resume_jsonl, write_jsonl
 from drake_clutter.resources import resource_path
 from drake_clutter.robots.model_parsing import read_model_text, read_torque_limits
@@ -202,6 +220,8 @@ def damage(path: Path, generator: np.random.Generator) -> None:
         path.write_text(yaml.dump(document, sort_keys=False), encoding="utf-8")
     elif structured and path.suffix == ".h5":
         damage_hdf5(path, generator)
+    elif structured and path.suffix == ".npz":
+        damage_archive(path, generator)
     elif structured and path.suffix == ".safetensors":
         damage_tensors(path, generator)
     elif structured and path.suffix == ".gz":
@@ -248,6 +268,23 @@ def damage_hdf5(path: Path, generator: np.random.Generator) -> None:
         elif k == len(changes) + 1:
             shape = (10**9, *values.shape[1:])
             owner.create_dataset(name, shape, values.dtype, chunks=True)
+
+
+def damage_archive(path: Path, generator: np.random.Generator) -> None:
+    """Change, replace or remove an array of a NumPy archive."""
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    name = str(generator.choice(sorted(arrays)))
+    values = arrays.pop(name)
+    changes = [
+        *(values[:-1], values[None], np.zeros((2, 3)), np.zeros(0), values.astype("S4")),
+        *(values.astype(float) * np.nan, np.full(values.shape, 10**6), values.astype(np.int8)),
+        np.full(values.shape, -7, values.dtype),
+    ]
+    k = int(generator.integers(len(changes) + 1))
+    if k < len(changes):
+        arrays[name] = changes[k]
+    np.savez(path, **arrays)
 
 
 def damage_tensors(path: Path, generator: np.random.Generator) -> None:
@@ -342,6 +379,50 @@ def recorded_episode(folder: Path) -> Reader:
     path = folder / "episode.h5"
     save_episode(path, synthetic_episode(rate=10.0, cameras={"overhead": 10}))
     return Reader([path], lambda: load_episode(path, CATALOG))
+
+
+def recorded_dataset(folder: Path) -> Reader:
+    """Return what reads a data set to check it, to summarize it and to go on with it."""
+    path = folder / "episodes" / "episode_000000.h5"
+    path.parent.mkdir()
+    save_episode(path, synthetic_episode(rate=10.0))
+
+    def read() -> None:
+        inspection = inspect_files(find_episode_files(folder), CATALOG)
+        describe_inspection(inspection_document(inspection))
+        for problem in inspection.problems:
+            raise InputError(f"{folder}: {problem}")
+        summarize_dataset([read_summary(path)])
+
+    return Reader([path], read)
+
+
+def lists_of_options(folder: Path) -> Reader:
+    """Return what reads the files of `--moves`, `--policy` and `--randomize`."""
+    moves, randomization = folder / "moves.yaml", folder / "randomization.yaml"
+    moves.write_text(to_yaml([{"pick": "a", "place": "tray"}, {"pick": "b", "place": "0.1,0,0,0"}]))
+    fields = {
+        name: value for group in RANDOMIZATION_GROUPS.values() for name, value in group.items()
+    }
+    randomization.write_text(to_yaml(to_plain(RandomizationConfig(**fields))))
+
+    def read() -> None:
+        read_moves(moves)
+        load_randomization(str(randomization))
+
+    return Reader([moves, randomization], read)
+
+
+def reachability_map(folder: Path) -> Reader:
+    """Return what reads and asks the inverse reachability map of a study that goes on."""
+    path = folder / "map.npz"
+    save_inverse_reachability(path, replace(disk_map(0.45), arm=Arm().geometry))
+    moves = move_rows((0.3, 0.0, 0.1), (0.3, 0.4, 0.2), 0.4)
+
+    def read() -> None:
+        reaches(load_inverse_reachability(path), moves, [[0.0, 0.2, 0.0, 0.0]], -1.0)
+
+    return Reader([path], read)
 
 
 def exploration() -> ClutterExploration:
@@ -614,7 +695,8 @@ def robot_files(folder: Path) -> Reader:
 READERS = [
     *(mesh_files, visual_files, own_catalog, robot_files),
     *(scene_file, config_file, cell_file, generator_checkpoint, explorer_checkpoint),
-    *(detector_checkpoint, trajectory_file, recorded_episode),
+    *(detector_checkpoint, trajectory_file, recorded_episode, recorded_dataset),
+    *(lists_of_options, reachability_map),
     *(soft_q_training, ppo_training, cloning_training),
     *(job_file, progress_file, scene_dataset, image_dataset, record_file, results_file),
     feasibility_parts,

@@ -21,7 +21,16 @@ def torch_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_all_checks_pass() -> None:
     found = {check.name: check for check in installation_check.run_checks()}
-    names = ["drake", "rendering", "compilation", "solvers", "torch", "assets", "machine"]
+    names = [
+        "drake",
+        "rendering",
+        "temporary",
+        "compilation",
+        "solvers",
+        "torch",
+        "assets",
+        "machine",
+    ]
     assert list(found) == names
     assert [check for check in found.values() if not check.ok] == []
     assert all(check.detail and not check.remedy for check in found.values())

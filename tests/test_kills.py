@@ -22,8 +22,11 @@ from typing import Any
 import pytest
 from conftest import DEFAULT_CELL, WORLD, resting, rng, scene_of
 from killable import Reply, Request
+from recorded_episodes import synthetic_episode
 
+from drake_clutter.files import INTERRUPTION
 from drake_clutter.grammar import Orientation
+from drake_clutter.recording.hdf5_file import save_episode
 from drake_clutter.scenes.scene_file import save_scene
 from drake_clutter.simulation.drake_judge import DrakeJudge
 
@@ -36,16 +39,18 @@ QUICK = {
     "evaluate": (CLI, "evaluate", "SCENES", "--agents", "random", "--out", "OUT/results.json"),
     "render": (CLI, "render", "SCENE", "--out", "OUT"),
 }
-"""Programs with their arguments; SCENE, SCENES and OUT are paths of the test."""
+"""Programs with their arguments; SCENE, SCENES, EPISODE, EPISODES and OUT are paths of the test."""
+RECORD = (
+    *(CLI, "record", "--scenes", "SCENES", "--policy", "random", "--episodes", "2"),
+    *("--max-moves", "1", "--cameras", "wrist", "--resolution", "64x48", "--out", "OUT"),
+)
 LONG = {
     "generate in two processes": (*QUICK["generate"], "--workers", "2"),
     "evaluate in two processes": (*QUICK["evaluate"], "--workers", "2"),
     "explore with the arm": (*QUICK["explore"], "--fidelity", "arm"),
-    "record": (
-        *(CLI, "record", "--scenes", "SCENES", "--policy", "random", "--episodes", "2"),
-        *("--max-moves", "1", "--cameras", "wrist", "--resolution", "64x48", "--out", "OUT"),
-        *("--format", "robomimic"),
-    ),
+    "record": (*RECORD, "--format", "robomimic"),
+    "record for LeRobot": (*RECORD, "--format", "lerobot"),
+    "record for Rerun and Foxglove": (*RECORD, "--format", "rerun", "--format", "mcap"),
     "move": (CLI, "move", "SCENE", "--pick", "upper", "--place", "tray", "--out", "OUT"),
     "move, plan": (
         *(CLI, "move", "SCENE", "--pick", "upper", "--place", "tray", "--out", "OUT"),
@@ -53,6 +58,15 @@ LONG = {
     ),
     "run": (CLI, "run", "--set", "scene=SCENE", "--set", "agent=random", "--out", "OUT"),
     "export": (CLI, "export", "SCENE", "--format", "sdf", "--out", "OUT"),
+    "export with the cell": (
+        *(CLI, "export", "SCENE", "--format", "mjcf", "--with-cell", "--out", "OUT"),
+    ),
+    "export to USD": (CLI, "export", "SCENE", "--format", "usd", "--with-cell", "--out", "OUT"),
+    "view": (CLI, "view", "SCENE", "--html", "OUT/scene.html"),
+    "replay to HTML": (CLI, "replay", "EPISODE", "--html", "OUT/episode.html"),
+    "replay to MP4": (CLI, "replay", "EPISODE", "--mp4", "OUT/episode.mp4"),
+    "replay to Rerun": (CLI, "replay", "EPISODE", "--rrd", "OUT/episode.rrd"),
+    "inspect": (CLI, "inspect", "EPISODES", "--plot", "OUT/figure.png"),
     "feasibility": (CLI, "feasibility", "SCENE", "--no-maps", "--out", "OUT"),
     "images": ("training.render_image_dataset", "--count", "20", "--out", "OUT"),
     "scene dataset": (
@@ -107,6 +121,8 @@ class KillServer:
         """Run a command, of which `stop` are the last fields of its `Request`."""
         places = {"OUT": str(out), "SCENES": str(self.folder / "scenes")}
         places["SCENE"] = str(self.folder / "scenes" / "scene.yaml")
+        places["EPISODES"] = str(self.folder / "episodes")
+        places["EPISODE"] = str(self.folder / "episodes" / "episode.h5")
         program, *arguments = COMMANDS[name]
         for place, path in places.items():
             arguments = [re.sub(rf"\b{place}\b", path, text) for text in arguments]
@@ -137,6 +153,8 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[KillServer]:
     verdict = DrakeJudge(WORLD).judge(scene, rng())
     assert verdict.hidden == ("lower",)
     save_scene(folder / "scenes" / "scene.yaml", scene, DEFAULT_CELL, verdict)
+    (folder / "episodes").mkdir()
+    save_episode(folder / "episodes" / "episode.h5", synthetic_episode())
     command = [sys.executable, str(Path(__file__).with_name("killable.py"))]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -197,6 +215,18 @@ def test_a_stopped_command_gives_the_same_result_when_it_is_repeated(
 
 
 @pytest.mark.parametrize("name", COMMANDS)
+def test_an_interrupted_command_says_so_in_its_last_line(name: str, server: KillServer) -> None:
+    reference, _ = server.run_undisturbed(name)
+    out = server.folder / f"{name} interrupted"
+    out.mkdir()
+    reply = server.run(name, out, stop_at=(1 + reference.changes) // 2, interrupt=True)
+    assert reply.exit_code == 130, read_log(out)
+    log = read_log(out)
+    assert "Traceback" not in log
+    assert log.splitlines()[-1] == INTERRUPTION
+
+
+@pytest.mark.parametrize("name", COMMANDS)
 def test_a_full_disk_is_reported_in_one_line(name: str, server: KillServer) -> None:
     server.run_undisturbed(name)  # It caches compiled functions, which are larger than the limit.
     out = server.folder / f"{name} full"
@@ -217,5 +247,5 @@ def test_an_output_of_the_wrong_kind_is_refused_in_one_line(name: str, server: K
     out.write_text("mine")
     assert server.run(name, out).exit_code == 2, read_log(out)
     (line,) = read_log(out).splitlines()
-    assert re.match(rf"error --(out|work) {out}\S*: ", line)
+    assert re.match(rf"error --(out|work|html|mp4|rrd|plot) {out}\S*: ", line)
     assert out.read_text() == "mine"

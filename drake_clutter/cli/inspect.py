@@ -6,8 +6,7 @@ from typing import Annotated
 import typer
 
 from drake_clutter.cli.options import CatalogOption, JsonOption
-from drake_clutter.cli.output import print_line, print_result, progress_bar
-from drake_clutter.files import InputError
+from drake_clutter.cli.output import print_line, print_result, progress_bar, writing_file
 
 MAX_LINES = 20
 """Number of outliers and of problems that are printed."""
@@ -56,11 +55,8 @@ def inspect(
         _print_lines("outlier", document["outliers"])
         _print_lines("problem", document["problems"])
     if plot is not None and inspection.episodes:
-        try:
+        with writing_file(plot, "--plot"):
             plot_dataset(plot, inspection.episodes)
-        except OSError as error:
-            problem = f"cannot be written ({error.strerror}); expected a writable path"
-            raise InputError(f"--plot {plot}: {problem}") from error
         if not as_json:
             print_line(f"Wrote {plot}.")
     if inspection.problems:

@@ -20,6 +20,7 @@ from rich.progress import (
 from rich.table import Table
 
 from drake_clutter.files import InputError
+from drake_clutter.outputs import output_file
 from drake_clutter.reports.terminal_text import describe_episode
 
 if TYPE_CHECKING:
@@ -138,6 +139,25 @@ def _progress(description: str) -> Progress:
     return Progress(*columns, console=err_console)
 
 
+@contextmanager
+def writing_file(path: Path, option: str) -> Iterator[None]:
+    """Lock a file while it is written.
+
+    Args:
+        path: The file.
+        option: Option that names it.
+
+    Raises:
+        InputError: The file cannot be written, or another run writes it.
+    """
+    with output_file(path, option):
+        try:
+            yield
+        except OSError as error:
+            problem = f"cannot be written ({error.strerror}); expected a writable path"
+            raise InputError(f"{option} {path}: {problem}") from error
+
+
 def show_recording(
     name: Path,
     scene: "Scene",
@@ -160,11 +180,8 @@ def show_recording(
     from drake_clutter.reports.recording import serve_recording, write_recording
 
     if html_file is not None:
-        try:
+        with writing_file(html_file, "--html"):
             write_recording(html_file, scene, frames, cell)
-        except OSError as error:
-            problem = f"cannot be written ({error.strerror}); expected a writable path"
-            raise InputError(f"--html {html_file}: {problem}") from error
         print_line(f"Wrote {html_file}.")
         return
     meshcat = serve_recording(scene, frames, cell)

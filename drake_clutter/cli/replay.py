@@ -6,7 +6,13 @@ from typing import Annotated
 import typer
 
 from drake_clutter.cli.options import CatalogOption, HtmlOption
-from drake_clutter.cli.output import out_console, print_line, progress_bar, show_recording
+from drake_clutter.cli.output import (
+    out_console,
+    print_line,
+    progress_bar,
+    show_recording,
+    writing_file,
+)
 from drake_clutter.files import InputError
 
 
@@ -51,7 +57,8 @@ def replay(
         check_modules("--rrd", {"rerun": "rerun-sdk"})
         from drake_clutter.recording.formats.rerun import write_rerun
 
-        write_rerun(rrd_file, episode)
+        with writing_file(rrd_file, "--rrd"):
+            write_rerun(rrd_file, episode)
         print_line(f"Wrote {rrd_file}.")
     if mp4_file is not None:
         from drake_clutter.reports.filmstrip import render_frames
@@ -61,7 +68,8 @@ def replay(
         frames = replay_frames(episode, speed, VIDEO_RATE)
         images = render_frames(episode.initial_scene, frames, episode.cell, VIDEO_SIDE)
         times = [frame.time for frame in frames]
-        write_video(mp4_file, progress_bar("pictures", images, 0, len(frames)), times)
+        with writing_file(mp4_file, "--mp4"):
+            write_video(mp4_file, progress_bar("pictures", images, 0, len(frames)), times)
         print_line(f"Wrote {mp4_file}.")
     if html_file is not None or (rrd_file is None and mp4_file is None):
         frames = replay_frames(episode, speed)

@@ -98,7 +98,7 @@ def read_summary(path: Path) -> EpisodeSummary:
             scene=str(file.attrs["scene_name"]),
             termination=str(file.attrs["termination"]),
             error=str(file.attrs["error"]),
-            results=tuple(str(action.attrs["result"]) for action in actions),
+            results=tuple(MoveResult(action.attrs["result"]).value for action in actions),
             duration=float(sum(time[-1] for time in times)),
         )
 

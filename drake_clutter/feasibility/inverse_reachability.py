@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -193,7 +194,46 @@ def load_inverse_reachability(path: Path) -> InverseReachabilityMap:
         names = [field.name for field in fields(ArmGeometry)]
         arm = ArmGeometry(**{name: arrays[f"arm.{name}"] for name in names})
         names = [field.name for field in fields(InverseReachabilityMap) if field.name != "arm"]
-        return InverseReachabilityMap(**{name: arrays[name] for name in names}, arm=arm)
+        found = InverseReachabilityMap(**{name: arrays[name] for name in names}, arm=arm)
+        _check_arrays(found)
+        return found
+
+
+def _check_arrays(found: InverseReachabilityMap) -> None:
+    """Check the arrays of a map, which compiled functions index without checks.
+
+    Raises:
+        ValueError: One has another shape or type, or holds an index out of range.
+    """
+    arm = found.arm
+    num_radii, num_heights = len(found.solutions), len(found.heights)
+    cells = num_radii, num_heights, NUM_YAWS
+    num_joints, num_capsules = max(len(arm.fixed) - 1, 0), len(arm.depths)
+    is_closed_form = len(arm.lengths) > 0
+    expected: list[tuple[NDArray[Any], type[np.generic], tuple[int, ...]]] = [
+        (found.heights, np.float64, (num_heights,)),
+        (found.solutions, np.uint8, cells),
+        (found.lowest, np.float32, (*cells, _MAX_SOLUTIONS)),
+        (found.turns, np.float32, (*cells, _MAX_SOLUTIONS)),
+        (found.turn_limits, np.float64, (2,)),
+        (arm.fixed, np.float64, (num_joints + is_closed_form, 4, 4)),
+        (arm.lengths, np.float64, (6 * is_closed_form,)),
+        (arm.X_0B, np.float64, (4, 4) if is_closed_form else (0, 4)),
+        (arm.X_G6, np.float64, (4, 4) if is_closed_form else (0, 4)),
+        (arm.depths, np.int64, (num_capsules,)),
+        (arm.ends, np.float64, (num_capsules, 2, 3)),
+        (arm.radii, np.float64, (num_capsules,)),
+        (arm.may_touch, np.bool_, (num_capsules,)),
+        (arm.pairs, np.int64, (len(arm.pairs), 2)),
+    ]
+    for array, dtype, shape in expected:
+        if array.shape != shape or array.dtype != dtype:
+            raise ValueError(f"an array {array.dtype}{array.shape}, not {dtype.__name__}{shape}")
+    for indices, end in ((arm.depths, num_joints + 1), (arm.pairs, num_capsules)):
+        if indices.size and not 0 <= indices.min() <= indices.max() < end:
+            raise ValueError(f"indices that are not from 0 to {end - 1}")
+    if not (num_heights and np.isfinite(found.heights).all()):
+        raise ValueError("heights that are no numbers")
 
 
 def save_inverse_reachability(path: Path, reachability: InverseReachabilityMap) -> None:

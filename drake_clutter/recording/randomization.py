@@ -19,7 +19,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
 from drake_clutter.catalog import ObjectClass
-from drake_clutter.files import InputError
+from drake_clutter.files import InputError, temporary_folder
 from drake_clutter.scenes.geometry import group_touching_objects, transport_pose
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject, sample_offsets
 from drake_clutter.validation import (
@@ -346,7 +346,7 @@ def varied_physics(scene: Scene, variation: Variation) -> Iterator[Scene]:
     if not variation.mass and not variation.friction:
         yield scene
         return
-    with TemporaryDirectory(prefix="drake_clutter_variants_") as folder:
+    with TemporaryDirectory(prefix="drake_clutter_variants_", dir=temporary_folder()) as folder:
         objects = [
             replace(
                 o,
