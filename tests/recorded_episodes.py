@@ -4,8 +4,11 @@ Its motion is no simulation: joints and the picked object follow smooth curves, 
 one color, from which its time can be read.
 """
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from conftest import DEFAULT_CELL, resting, scene_of
@@ -157,6 +160,26 @@ def synthetic_episode(
         package_version="0",
         drake_version="0",
     )
+
+
+def read_rerun(path: Path) -> dict[str, list[tuple[float, dict[str, Any]]]]:
+    """Return the rows of each entity of a file for Rerun, in order of time.
+
+    A row is a time [s], NaN if it is static, and values by component.
+    """
+    import pyarrow as pa
+    from rerun.chunk import RrdReader
+
+    rows = defaultdict(list)
+    for chunk in RrdReader(str(path)).stream():
+        batch = chunk.to_record_batch()
+        # Python has no times in nanoseconds.
+        columns = [c.cast(pa.int64()) if pa.types.is_temporal(c.type) else c for c in batch.columns]
+        for row in pa.RecordBatch.from_arrays(columns, batch.schema.names).to_pylist():
+            nanoseconds = row.pop("time", None)
+            time = np.nan if nanoseconds is None else nanoseconds / 1e9
+            rows[str(chunk.entity_path)].append((time, row))
+    return {path: sorted(found, key=lambda row: row[0]) for path, found in rows.items()}
 
 
 def with_samples(episode: RecordedEpisode, number: int, samples: ActionSamples) -> RecordedEpisode:

@@ -279,7 +279,7 @@ def damage_archive(path: Path, generator: np.random.Generator) -> None:
     changes = [
         *(values[:-1], values[None], np.zeros((2, 3)), np.zeros(0), values.astype("S4")),
         *(values.astype(float) * np.nan, np.full(values.shape, 10**6), values.astype(np.int8)),
-        np.full(values.shape, -7, values.dtype),
+        np.full(values.shape, -7).astype(values.dtype),
     ]
     k = int(generator.integers(len(changes) + 1))
     if k < len(changes):
@@ -416,7 +416,10 @@ def lists_of_options(folder: Path) -> Reader:
 def reachability_map(folder: Path) -> Reader:
     """Return what reads and asks the inverse reachability map of a study that goes on."""
     path = folder / "map.npz"
-    save_inverse_reachability(path, replace(disk_map(0.45), arm=Arm().geometry))
+    whole = disk_map(0.45)
+    part = {name: getattr(whole, name)[:9, :6] for name in ("solutions", "lowest", "turns")}
+    small = replace(whole, heights=whole.heights[:6], arm=Arm().geometry, **part)
+    save_inverse_reachability(path, small)
     moves = move_rows((0.3, 0.0, 0.1), (0.3, 0.4, 0.2), 0.4)
 
     def read() -> None:

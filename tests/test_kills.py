@@ -22,7 +22,7 @@ from typing import Any
 import pytest
 from conftest import DEFAULT_CELL, WORLD, resting, rng, scene_of
 from killable import Reply, Request
-from recorded_episodes import synthetic_episode
+from recorded_episodes import read_rerun, synthetic_episode
 
 from drake_clutter.files import INTERRUPTION
 from drake_clutter.grammar import Orientation
@@ -180,6 +180,15 @@ def read_tree(out: Path) -> Tree:
             table = parquet.read_table(path)
             rows = [row | {"planning_s": ""} for row in table.to_pylist()]
             tree[str(path.relative_to(out))] = json.dumps(rows)
+        elif path.is_file() and path.suffix == ".rrd":  # Its rows have random identifiers.
+            entities = {
+                entity: [
+                    (time, {name: value for name, value in row.items() if "RowId" not in name})
+                    for time, row in rows
+                ]
+                for entity, rows in read_rerun(path).items()
+            }
+            tree[str(path.relative_to(out))] = repr(sorted(entities.items(), key=lambda e: e[0]))
         elif path.is_file() and path.suffix in (".json", ".html"):
             text = path.read_text().replace(str(out), "OUT")
             tree[str(path.relative_to(out))] = WALL_TIMES.sub(r"\g<key>", text)

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
 import trimesh
 from mcap.reader import make_reader
@@ -18,8 +17,14 @@ from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
 from PIL import Image
 from pydrake.geometry import Box, Mesh
-from recorded_episodes import HOME, PRESSURE, SCENE, image_level, synthetic_episode
-from rerun.chunk import RrdReader
+from recorded_episodes import (
+    HOME,
+    PRESSURE,
+    SCENE,
+    image_level,
+    read_rerun,
+    synthetic_episode,
+)
 
 from drake_clutter.catalog import load_catalog
 from drake_clutter.recording.formats.episode_timeline import events, start_times
@@ -65,16 +70,7 @@ def rrd(
     path = tmp_path_factory.mktemp("rerun") / "episode.rrd"
     write_rerun(path, episode)
     assert [entry.name for entry in path.parent.iterdir()] == ["episode.rrd"]
-    rows = defaultdict(list)
-    for chunk in RrdReader(str(path)).stream():
-        batch = chunk.to_record_batch()
-        # Python has no times in nanoseconds.
-        columns = [c.cast(pa.int64()) if pa.types.is_temporal(c.type) else c for c in batch.columns]
-        for row in pa.RecordBatch.from_arrays(columns, batch.schema.names).to_pylist():
-            nanoseconds = row.pop("time", None)
-            time = np.nan if nanoseconds is None else nanoseconds / 1e9
-            rows[str(chunk.entity_path)].append((time, row))
-    return {path: sorted(found, key=lambda row: row[0]) for path, found in rows.items()}
+    return read_rerun(path)
 
 
 @pytest.fixture(scope="module")
@@ -265,9 +261,9 @@ def test_meshes_of_shapes_and_files(tmp_path: Path) -> None:
 def test_an_episode_of_version_1_is_shown_without_what_it_does_not_hold(tmp_path: Path) -> None:
     episode = load_episode(VERSION_1, load_catalog())
     write_rerun(tmp_path / "episode.rrd", episode)
-    rows: Counter[str] = Counter()
-    for chunk in RrdReader(str(tmp_path / "episode.rrd")).stream():
-        rows[str(chunk.entity_path)] += chunk.num_rows
+    rows = Counter(
+        {name: len(found) for name, found in read_rerun(tmp_path / "episode.rrd").items()}
+    )
     samples = episode.actions[0].samples
     assert samples is not None
     assert rows["/robot/wrist_3"] == 1 + len(samples)
