@@ -128,7 +128,8 @@ def _lock(lock_file: Path, out: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        error.filename = error.filename or str(out)
+        if error.filename is None:
+            raise OSError(error.errno, error.strerror, str(out)) from error
         raise
     finally:
         with suppress(FileNotFoundError):
@@ -142,8 +143,7 @@ def _acquire(lock_file: Path, out: Path) -> int:
         try:
             descriptor = os.open(lock_file, os.O_RDWR | os.O_CREAT, 0o644)
         except OSError as error:
-            error.filename = str(out)
-            raise
+            raise OSError(error.errno, error.strerror, str(out)) from error
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:

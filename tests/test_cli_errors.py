@@ -134,6 +134,17 @@ def test_the_error_of_an_atomic_write_names_the_file(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="No space") as full, atomic_write(tmp_path / "a.json"):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert full.value.filename == str(tmp_path / "a.json")
+
+    class LibraryError(OSError):
+        """An error whose file name cannot be set, as those of PyAV."""
+
+        @property
+        def filename(self) -> None:
+            return None
+
+    with pytest.raises(OSError, match="No space") as full, atomic_write(tmp_path / "a.mp4"):
+        raise LibraryError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert full.value.filename == str(tmp_path / "a.mp4")
     with pytest.raises(FileNotFoundError) as missing, atomic_write(tmp_path / "b" / "a.json") as t:
         t.write_text("x")
     assert missing.value.filename == str(tmp_path / "b" / "a.json")

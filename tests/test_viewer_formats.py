@@ -3,8 +3,11 @@
 # trimesh is typed in part only.
 # mypy: allow-untyped-calls
 
+import errno
 import io
 import json
+import os
+import resource
 from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any
@@ -256,6 +259,20 @@ def test_meshes_of_shapes_and_files(tmp_path: Path) -> None:
     trimesh.creation.box([0.1, 0.2, 0.3]).export(tmp_path / "box.gltf")
     (mesh,) = shape_meshes(Mesh(str(tmp_path / "box.gltf"), 2.0), (0.0, 1.0, 0.0, 1.0))
     assert mesh.extents == pytest.approx([0.2, 0.6, 0.4]), "the y axis of glTF points up"
+
+
+def test_a_full_disk_ends_a_file_for_rerun(episode: RecordedEpisode, tmp_path: Path) -> None:
+    """Rerun's own writer waits forever."""
+    path = tmp_path / "episode.rrd"
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        with pytest.raises(OSError, match=os.strerror(errno.EFBIG)) as full:
+            write_rerun(path, episode)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert full.value.filename == str(path)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_episode_of_version_1_is_shown_without_what_it_does_not_hold(tmp_path: Path) -> None:

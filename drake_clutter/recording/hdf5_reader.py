@@ -152,8 +152,12 @@ class ActionReader:
         if not np.isnan(place).all():
             self._check_poses("X_TO_place", place)
             X_TO_place = Pose(tuple(place[4:].tolist()), tuple(place[:4].tolist()))
+        pick = attributes.text("pick")
+        if pick not in self._axes["objects"]:
+            problem = f"pick: {format_value(pick)}"
+            raise input_error(self._source, f"{problem}; expected the name of an object")
         return RecordedAction(
-            Move(attributes.text("pick"), attributes.text("place")),
+            Move(pick, attributes.text("place")),
             attributes.choice("result", MoveResult),
             **{name: attributes.text(name) for name in ACTION_TEXTS},
             X_TO_place=X_TO_place,

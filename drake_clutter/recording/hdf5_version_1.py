@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from drake_clutter.catalog import Catalog
 from drake_clutter.cell.work_cell import WorkCell, default_cell
 from drake_clutter.config import upgrade_cell
-from drake_clutter.files import InputError
+from drake_clutter.files import InputError, format_value, input_error
 from drake_clutter.limits import MAX_SAMPLES
 from drake_clutter.recording.recorded_episode import RecordedAction, RecordedEpisode
 from drake_clutter.scenes.action_samples import CHANNELS, ActionSamples
@@ -110,6 +110,10 @@ def _read_move(
     allowed = [member.value for member in MoveResult]
     if result not in allowed:
         raise InputError(f"{path}:{name}: result {result!r}; expected {', '.join(allowed)}")
+    pick = str(group.attrs["pick"])
+    if pick not in axes["objects"]:
+        problem = f"pick: {format_value(pick)}"
+        raise input_error(f"{path}:{name}", f"{problem}; expected the name of an object")
     values: dict[str, Any] = {}
     for channel in CHANNELS:
         shape = (len(arrays["time"]), *(len(axes[axis]) for axis in channel.axes))
@@ -117,7 +121,7 @@ def _read_move(
         values[channel.name] = arrays.get(channel.name, default)
     values["tool_commanded"] = np.where(arrays["suction"], tools.index(tool), -1).astype(np.int16)
     return RecordedAction(
-        move=Move(str(group.attrs["pick"]), str(group.attrs["place"])),
+        move=Move(pick, str(group.attrs["place"])),
         result=MoveResult(result),
         detail=str(group.attrs["detail"]),
         tool=tool,

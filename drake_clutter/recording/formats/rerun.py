@@ -63,18 +63,18 @@ def write_rerun(path: Path, episode: RecordedEpisode) -> None:
         path: File to write, which appears when it is complete.
         episode: The episode.
     """
+    recording = rr.RecordingStream(
+        _APPLICATION, recording_id=f"{episode.scene_name}-{episode.seed}-{episode.index}"
+    )
+    recording.set_log_time_enabled(False)
+    recording.set_log_tick_enabled(False)
+    # Not into the file at once: on a full disk, Rerun's thread ends, and `flush` waits forever.
+    memory = recording.memory_recording()
+    recording.send_blueprint(_blueprint(episode))
+    recording.send_recording_name(f"episode {episode.index}: {episode.scene_name}")
+    _Logger(recording, episode).log()
     with atomic_write(path) as temporary:
-        recording = rr.RecordingStream(
-            _APPLICATION, recording_id=f"{episode.scene_name}-{episode.seed}-{episode.index}"
-        )
-        recording.set_log_time_enabled(False)
-        recording.set_log_tick_enabled(False)
-        recording.save(temporary)
-        recording.send_blueprint(_blueprint(episode))
-        recording.send_recording_name(f"episode {episode.index}: {episode.scene_name}")
-        _Logger(recording, episode).log()
-        recording.flush()
-        recording.disconnect()
+        temporary.write_bytes(memory.drain_as_bytes())
 
 
 def _blueprint(episode: RecordedEpisode) -> Any:
