@@ -182,6 +182,17 @@ def test_what_carries_a_box_is_named() -> None:
     assert believed([box, can]).supports == ()
 
 
+def test_where_nothing_fits_nothing_is_left() -> None:
+    """A box that seems to float 10 mm high is at a wrong pose: no object is so flat."""
+    for floor, is_left in ((0.010, False), (0.018, True)):
+        box = resting("cracker_box", floor=floor)
+        belief = believed([box])
+        (support,) = belief.supports
+        assert support.classes == (("large_marker",) if is_left else ())
+        assert (belief.nothing_left < 0.05) == is_left
+        assert (belief.nothing_left > 0.95) != is_left
+
+
 def test_points_of_no_known_object_are_something() -> None:
     belief = believed([resting("cracker_box")], resting("sugar_box", xy=(0.0, 0.25)))
     assert belief.supports == ()

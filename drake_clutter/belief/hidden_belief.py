@@ -38,6 +38,8 @@ from drake_clutter.scenes.scene import SceneObject
 class HiddenSupport:
     """Something hidden that carries a known object, or may carry it.
 
+    Without a class that fits, no hidden object carries it, but a pose of the belief is wrong.
+
     Attributes:
         carried: Name of the known object.
         is_certain: Whether known objects do not carry it, whatever the doubt of the poses.
@@ -114,6 +116,10 @@ def estimate_hidden(
     shadow = float(np.mean([area.shadow for area in areas.values()]))
     nothing_left = math.exp(-config.covered_rate * covered - config.shadow_rate * shadow)
     for support in supports:
+        if (
+            not support.classes
+        ):  # Nothing fits: the pose of the object or of what carries it is wrong.
+            continue
         nothing_left *= 1 - (
             config.uncarried_probability if support.is_certain else config.doubtful_probability
         )

@@ -33,7 +33,11 @@ def belief_html(hidden: Mapping[str, Any], heading: str) -> str:
 def _support_text(support: Mapping[str, Any]) -> str:
     """Return a sentence about what carries a known object."""
     verb = "stands" if support["is_certain"] else "may stand"
-    classes = _class_names(support["classes"]) or "no known class"
+    classes = _class_names(support["classes"])
+    if not classes:
+        return (
+            f"{display_name(support['carried'])} {verb} on nothing known, but no class fits below."
+        )
     return (
         f"{display_name(support['carried'])} {verb} on something hidden, "
         f"{1000 * support['gap']:.0f} mm above what is known below; there fits: {classes}."
