@@ -1,5 +1,6 @@
 """Cloning of a reaching policy: targets from images, waypoints, and playback in the station."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +45,8 @@ def demonstrations() -> list[Demonstration]:
         time = np.linspace(approach.start_time(), approach.end_time(), 40)
         found.append(
             Demonstration(
-                name=f"episode_{number:06d} 0",
+                name=f"episode_{number:06d} 1",
+                scene_name=f"scene {number}",
                 cell=DEFAULT_CELL,
                 scene=scene_of(box),
                 pick="sugar_box",
@@ -152,10 +154,14 @@ def test_first_images_are_those_of_the_recording(tmp_path: Path) -> None:
     assert read_first_images(tmp_path / "episode.h5", 2) is None  # It was not executed.
 
 
-def test_held_out_moves_are_of_other_episodes(demonstrations: list[Demonstration]) -> None:
+def test_held_out_moves_are_of_other_scenes(demonstrations: list[Demonstration]) -> None:
     learned, held_out = split(demonstrations, 1)
-    assert [d.name for d in learned] == ["episode_000000 0", "episode_000001 0"]
-    assert [d.name for d in held_out] == ["episode_000002 0"]
+    assert [d.name for d in learned] == ["episode_000000 1", "episode_000001 1"]
+    assert [d.name for d in held_out] == ["episode_000002 1"]
+    again = replace(demonstrations[0], name="episode_000003 1")
+    learned, held_out = split([*demonstrations, again], 1)
+    assert [d.name for d in learned] == ["episode_000001 1", "episode_000002 1"]
+    assert held_out == [again]
     with pytest.raises(InputError, match="held_out: 2 of 3 moves; expected at most half"):
         split(demonstrations, 2)
 

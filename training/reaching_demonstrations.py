@@ -36,6 +36,7 @@ class Demonstration:
 
     Attributes:
         name: Episode and number of the action.
+        scene_name: Name of the scene of the episode.
         cell: Work cell.
         scene: Scene at the start.
         pick: Name of the picked object.
@@ -48,6 +49,7 @@ class Demonstration:
     """
 
     name: str
+    scene_name: str
     cell: WorkCell
     scene: Scene
     pick: str
@@ -169,6 +171,7 @@ def read_demonstrations(folder: Path, tool: str) -> list[Demonstration]:
             demonstrations.append(
                 Demonstration(
                     name=f"{path.stem} {number}",
+                    scene_name=episode.scene_name,
                     cell=episode.cell,
                     scene=scene,
                     pick=action.move.pick,
@@ -188,7 +191,14 @@ def read_demonstrations(folder: Path, tool: str) -> list[Demonstration]:
 def split(
     demonstrations: Sequence[Demonstration], num_held_out: int
 ) -> tuple[list[Demonstration], list[Demonstration]]:
-    """Return training and held-out moves; no episode is in both.
+    """Return training and held-out moves; no scene is in both.
+
+    Episodes go through the scenes of a data set again and again. Moves of earlier episodes with the
+    scenes of held-out moves are left out.
+
+    Args:
+        demonstrations: Moves in the order of their episodes.
+        num_held_out: Number of the last moves, which are not learned from.
 
     Raises:
         InputError: There are not enough moves.
@@ -196,9 +206,9 @@ def split(
     if len(demonstrations) < 2 * num_held_out:
         found = f"held_out: {num_held_out} of {len(demonstrations)} moves"
         raise InputError(f"{found}; expected at most half of them")
-    first = demonstrations[-num_held_out].name.partition(" ")[0]
-    held_out = [d for d in demonstrations if d.name.partition(" ")[0] >= first]
-    return [d for d in demonstrations if d not in held_out], held_out[-num_held_out:]
+    held_out = list(demonstrations[-num_held_out:])
+    scenes = {d.scene_name for d in held_out}
+    return [d for d in demonstrations if d.scene_name not in scenes], held_out
 
 
 class ToolKinematics:

@@ -42,7 +42,7 @@ class CloningConfig:
         data: Folder that `drake-clutter record` wrote.
         tool: Name of the tool whose moves are learned; it must be on the axis of the last joint.
         observation: Where the target comes from: `state` or `depth`.
-        held_out: Number of moves, of the last episodes, that are not learned from.
+        held_out: Number of the last moves, whose scenes are not learned from.
         seed: Random seed.
         steps: Number of batches.
         batch_size: States in a batch.

@@ -354,7 +354,7 @@ def _cloning() -> str:
         f"object. They learn from moves with the tool `{results['rows'][0]['tool']}`. *Reached*: "
         "the policy ends where the cup can attach to the object, which has not "
         f"moved by more than {results['max_displacement_mm']:g} mm. Held-out moves are of other "
-        "episodes.",
+        "scenes.",
         command="python training/train_bc.py evaluate runs/bc_state runs/bc_depth --out FILE",
         seed=", ".join(str(seed) for seed in sorted({row["seed"] for row in results["rows"]})),
         results=[f"training/results/{CLONING}"],
