@@ -234,7 +234,7 @@ def test_a_folder_of_another_job_is_refused(
         (("--channels", "rgb,color"), "--channels color: expected some of rgb, depth"),
         (("--resolution", "640"), "--resolution 640: expected WIDTHxHEIGHT, each from 16 to 4096"),
         (("--randomize", "all"), "--randomize all: expected some of poses, mass"),
-        (("--policy", "clever"), "clever; expected random"),
+        (("--policy", "clever"), "--policy clever; expected random"),
         (("--policy", "none.yaml"), "none.yaml"),
         (("--set", "support.size=[0.6,0.6]"), "the support is that of the scene"),
     ],

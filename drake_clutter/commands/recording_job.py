@@ -14,6 +14,7 @@ from drake_clutter.agents.explorers import (
 from drake_clutter.commands.episode_scenes import SceneSource
 from drake_clutter.commands.explore_scene import move_list_policy
 from drake_clutter.config import ClutterConfig
+from drake_clutter.files import InputError
 from drake_clutter.learning.pretrained import checkpoint_sha256
 from drake_clutter.recording.camera_recorder import CameraChannel, RecordedCamera, find_cameras
 from drake_clutter.recording.hdf5_file import FORMAT_VERSION
@@ -93,7 +94,11 @@ class RecordingJob:
         """
         policy = self.policy
         if isinstance(policy, str):
-            return make_policy_factory(policy, self.config, self.scenes.classes)
+            try:
+                return make_policy_factory(policy, self.config, self.scenes.classes)
+            except InputError as error:  # Of an option that other commands call --agent.
+                message = str(error).replace("--agent", "--policy", 1)
+                raise InputError(message) from None
         if isinstance(policy, tuple):
             return partial(move_list_policy, policy)
         return lambda _: policy

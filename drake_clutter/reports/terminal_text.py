@@ -48,7 +48,7 @@ def describe_dataset(summary: Mapping[str, Any]) -> dict[str, str]:
         "moves": f"{summary['moves']:,}, {summary['executed_moves']:,} of them carried out",
         "results": _counts(summary["results"]),
         "ends of episodes": _counts(summary["terminations"]),
-        "recorded motion": f"{summary['recorded_seconds'] / 3600:.2f} h",
+        "recorded motion": f"{summary['recorded_seconds'] / 60:,.1f} min",
     }
     if summary["errors"]:
         rows["policy errors"] = f"{len(summary['errors']):,} episodes"
