@@ -4,6 +4,7 @@
 # mypy: allow-untyped-calls
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from drake_clutter.assets import build_assets
 from drake_clutter.catalog import ObjectClass, load_catalog
 from drake_clutter.grammar import Orientation
 from drake_clutter.scenes.geometry import (
+    find_piles,
     group_touching_objects,
     max_penetration,
     penetration_depth,
@@ -357,3 +359,17 @@ def test_carried() -> None:
     put = transport_pose(believed, Pose((0.0, 0.2, 0.05), quarter), real)
     assert put.p == pytest.approx([0.0, 0.21, 0.05]), "the error turns with it"
     assert put.quaternion == pytest.approx(quarter)
+
+
+def test_piles_are_of_objects_that_touch_not_of_bounding_boxes_that_meet() -> None:
+    """A box turned by 45 deg stands 5 mm beside another one, along the diagonal."""
+    box = resting("cracker_box")
+    xy = (sum(box.bounds_T[1][:2]) / math.sqrt(2) + box.bounds_T[1][0] + 0.005) / math.sqrt(2)
+    R = Rotation.from_euler("z", 45, degrees=True).as_matrix() @ box.X_TO.rotation
+    X_TO = Pose.from_rotation(R, (xy, xy, box.X_TO.p[2]))
+    turned = replace(box, name="turned", X_TO=X_TO)
+    upper = resting("tomato_soup_can", xy=(xy, xy), floor=box.top_height)
+    assert len(group_touching_objects([box, turned], 0.0)) == 1
+    assert find_piles([box, turned, upper], 0.004) == [[box], [turned, upper]]
+    assert find_piles([box, turned, upper], 0.006) == [[box, turned, upper]]
+    assert find_piles([], 0.001) == []

@@ -213,6 +213,40 @@ def group_touching_objects(
     return [[objects[i] for i in sorted(group)] for group in nx.connected_components(adjacency)]
 
 
+def pairs_within(
+    first: Sequence[SceneObject], second: Sequence[SceneObject], distance: float
+) -> list[tuple[SceneObject, SceneObject]]:
+    """Return the pairs of two sets of objects that are at most a distance apart [m].
+
+    Distances are those of `penetration_depth`.
+    """
+    if not first or not second:
+        return []
+    (lower_a, upper_a), (lower_b, upper_b) = (
+        np.array([o.bounds_T for o in objects]).swapaxes(0, 1) for objects in (first, second)
+    )
+    gaps = np.maximum(lower_a[:, None] - upper_b, lower_b - upper_a[:, None]).max(axis=2)
+    near = [(first[i], second[j]) for i, j in np.argwhere(gaps <= distance).tolist()]
+    return [(a, b) for a, b in near if penetration_depth(a, b) >= -distance]
+
+
+def find_piles(objects: Sequence[SceneObject], margin: float) -> list[list[SceneObject]]:
+    """Return the objects in piles that do not touch each other.
+
+    Piles are smaller than the groups of `group_touching_objects` and take longer to find.
+
+    Args:
+        objects: Objects of a scene.
+        margin: Objects that are at most this far apart share a pile [m].
+    """
+    piles = nx.Graph()
+    piles.add_nodes_from(range(len(objects)))
+    for k, o in enumerate(objects):
+        near = {other.name for _, other in pairs_within([o], objects[:k], margin)}
+        piles.add_edges_from((k, i) for i in range(k) if objects[i].name in near)
+    return [[objects[i] for i in sorted(pile)] for pile in nx.connected_components(piles)]
+
+
 def transport_pose(X_TA: Pose, X_TA_new: Pose, X_TO: Pose) -> Pose:
     """Return the pose of an object O that moves rigidly with a frame A.
 

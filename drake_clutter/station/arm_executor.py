@@ -12,7 +12,7 @@ from drake_clutter.planning.motion_plan import HeldObject
 from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.scenes.geometry import group_touching_objects
+from drake_clutter.scenes.geometry import find_piles
 from drake_clutter.scenes.interfaces import (
     Instability,
     InstabilityReason,
@@ -165,9 +165,9 @@ def evaluate_outcome(
             for o in before.objects
             if np.linalg.norm(after[o.name].X_TO.p - o.X_TO.p) > MIN_DISPLACEMENT
         } | {pick}
-        for group in group_touching_objects(after.objects, TOUCHING_MARGIN):
-            if not disturbed.isdisjoint(o.name for o in group):
-                after = after.with_poses(settle(group, support, config, beside=beside).poses)
+        for pile in find_piles(after.objects, TOUCHING_MARGIN):
+            if not disturbed.isdisjoint(o.name for o in pile):
+                after = after.with_poses(settle(pile, support, config, beside=beside).poses)
         instability = worst_instability(checked, after, config, beside)
     result = MoveResult.PLACED
     if lost_object:

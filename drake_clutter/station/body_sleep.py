@@ -7,14 +7,13 @@ from collections import deque
 from collections.abc import Sequence, Set
 from dataclasses import replace
 
-import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import CollisionFilterDeclaration, FilterId, GeometrySet
 from pydrake.systems.framework import Context
 
 from drake_clutter.planning.motion_plan import Plan
-from drake_clutter.scenes.geometry import penetration_depth, transport_pose
+from drake_clutter.scenes.geometry import find_piles, pairs_within, transport_pose
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.drake_judge import TOUCHING_MARGIN
 from drake_clutter.simulation.scene_plant import get_support_body
@@ -84,33 +83,10 @@ def _names_near(copies: Sequence[SceneObject], objects: Sequence[SceneObject]) -
         objects: All objects.
     """
     name = copies[0].name
-    piles = nx.Graph()
-    piles.add_nodes_from(o.name for o in objects)
-    piles.add_edges_from(
-        (a.name, b.name) for a, b in _pairs_within(objects, objects, CONTACT_MARGIN)
-    )
     others = [o for o in objects if o.name != name]
-    touched = {o.name for _, o in _pairs_within(copies, others, TOUCHING_MARGIN)}
-    return frozenset({name}).union(*(nx.node_connected_component(piles, o) for o in touched))
-
-
-def _pairs_within(
-    first: Sequence[SceneObject], second: Sequence[SceneObject], distance: float
-) -> list[tuple[SceneObject, SceneObject]]:
-    """Return the pairs of objects that are at most a distance apart [m]; each pair once."""
-    if not first or not second:
-        return []
-    lower_a, upper_a = (
-        np.array(bounds) for bounds in zip(*(o.bounds_T for o in first), strict=True)
-    )
-    lower_b, upper_b = (
-        np.array(bounds) for bounds in zip(*(o.bounds_T for o in second), strict=True)
-    )
-    gaps = np.maximum(lower_a[:, None] - upper_b, lower_b - upper_a[:, None]).max(axis=2)
-    pairs = [(first[i], second[j]) for i, j in np.argwhere(gaps <= distance).tolist()]
-    if first is second:
-        pairs = [(a, b) for a, b in pairs if a.name < b.name]
-    return [(a, b) for a, b in pairs if penetration_depth(a, b) >= -distance]
+    touched = {o.name for _, o in pairs_within(copies, others, TOUCHING_MARGIN)}
+    piles = ({o.name for o in pile} for pile in find_piles(objects, CONTACT_MARGIN))
+    return frozenset({name}).union(*(pile for pile in piles if not touched.isdisjoint(pile)))
 
 
 def bodies_to_wake(

@@ -54,6 +54,8 @@ MAX_COARSE_TILT = math.radians(1)
 _TIME_MARGIN = 0.001
 """Time by which the simulator advances beyond a step [s], so that rounding does not decide which
 update of the plant belongs to it; less than a time step."""
+_STEP_TOLERANCE = 1e-6
+"""Difference of a time from a step that is due to rounding, as a fraction of the step."""
 _GRIPPER_UPDATES_PER_STEP = round(STEP_PERIOD / GRIPPER_UPDATE_PERIOD)
 MAX_START_ERROR = 1e-4
 """Largest difference between the commanded joints and the start of a plan [rad]."""
@@ -340,6 +342,23 @@ class StationSimulation:
             self.gripper.update(self.root)
         self._num_steps += 1
 
+    @property
+    def is_idle(self) -> bool:
+        """Whether nothing moves: no plan is executed, and all objects are asleep."""
+        return self.is_at_rest and self.is_asleep
+
+    def skip_until(self, time: float) -> None:
+        """Advance to the last step before a time [s] without simulating what is in between.
+
+        Nothing may move, and no system of the diagram may act before that time.
+        """
+        num_steps = math.ceil(time / STEP_PERIOD - _STEP_TOLERANCE) - 1
+        if num_steps <= self._num_steps:
+            return
+        self._num_steps = num_steps
+        self.root.SetTime(num_steps * STEP_PERIOD + _TIME_MARGIN)
+        self.simulator.Initialize(InitializeParams(suppress_initialization_events=True))
+
     def run_until(self, condition: Callable[[], bool]) -> None:
         """Step until a condition holds; it is checked before each step."""
         while not condition():
@@ -458,9 +477,7 @@ class StationSimulation:
         self._affected_plan = state.number
         self._affected = other._affected
         # The step before the end, so that all systems notice the end when they would.
-        self._num_steps = math.ceil(executed.end_time / STEP_PERIOD) - 1
-        root.SetTime(self._num_steps * STEP_PERIOD + _TIME_MARGIN)
-        self.simulator.Initialize(InitializeParams(suppress_initialization_events=True))
+        self.skip_until(executed.end_time)
         if self.recorder is not None:
             self.recorder.skip(state.number)
 

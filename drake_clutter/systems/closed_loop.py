@@ -232,8 +232,18 @@ class ClosedLoop:
             motion.release()
             if result is not None:
                 return result.samples
+        if simulation.is_idle:
+            simulation.skip_until(self._next_action_time())
         simulation.step()
         return self._take_samples()
+
+    def _next_action_time(self) -> float:
+        """Return a time before which policy and planner only wait [s]."""
+        state = self._state
+        if state.phase is PolicyPhase.OBSERVING:
+            return state.observation_time
+        context = self.planner_system.GetMyContextFromRoot(self.simulation.root)
+        return self.planner_system.response_time(context)
 
     def _take_samples(self) -> ActionSamples | None:
         """Return the samples of a motion that has ended; None if none has, or without a rate."""

@@ -74,6 +74,11 @@ class PlannerSystem(LeafSystem):
         response: PlanResponse = context.get_abstract_state(self._response).get_value()
         return response
 
+    def response_time(self, context: Context) -> float:
+        """Return the time of the response to the latest request that has arrived [s]."""
+        _, arrival_time = context.get_discrete_state(self._received).value()
+        return float(arrival_time) + self._latency
+
     def _update(self, context: Context, state: State) -> EventStatus:
         request: PlanRequest = self._request.Eval(context)
         if request.number in (0, self.response(context).number):
