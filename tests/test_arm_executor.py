@@ -273,7 +273,12 @@ def test_an_object_of_unknown_height_is_lowered_until_contact(
     guarded = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(max_guarded_descent=0.08))
     plan = guarded.plan([taken_for], taken_for.name, X_TO)
     assert isinstance(plan, PickPlacePlan)
-    result = StationSimulation(DEFAULT_CELL, scene_of(stands)).execute(plan)
+    simulation = StationSimulation(DEFAULT_CELL, scene_of(stands))
+    result = simulation.execute(plan)
+    context = simulation.executor.GetMyContextFromRoot(simulation.root)
+    status = simulation.executor.GetOutputPort("status").Eval(context)
+    assert status.felt_mass == pytest.approx(stands.object_class.mass, abs=0.003)
+    assert status.has_touched
     assert result.lowered_distance == pytest.approx(too_tall + 0.003, abs=0.002)
     assert result.poses[stands.name].p == pytest.approx([0.2, -0.2, 0.055], abs=0.003)
 

@@ -361,6 +361,23 @@ def test_likelihoods_of_several_moves_multiply() -> None:
     assert belief.remove(["pudding_box"]).touch == {}
 
 
+def test_an_object_that_was_not_grasped_is_not_picked_again_unchanged() -> None:
+    """Another object's move clears the invalid moves, but not those of the object."""
+    box, can = resting("sugar_box", xy=(0.2, 0.0)), resting("tomato_soup_can", xy=(-0.2, 0.0))
+    observation = seen(box, can)
+    belief = Belief().update(observation)
+    belief = belief.record(Move("sugar_box"), MoveResult.NOT_GRASPED).update(observation)
+    refused = {Move("sugar_box"), Move("sugar_box", "tomato_soup_can")}
+    assert set(belief.invalid_moves) == refused
+    moved = replace(can, X_TO=can.X_TO.translated((0.0, 0.1, 0.0)))
+    belief = belief.record(Move("tomato_soup_can"), MoveResult.PLACED, moved.X_TO)
+    belief = belief.update(seen(box, moved))
+    assert set(belief.invalid_moves) == refused
+    belief = belief.record(Move("tomato_soup_can"), MoveResult.PLACED, can.X_TO)
+    shifted = replace(box, X_TO=box.X_TO.translated((0.0, 0.02, 0.0)))
+    assert belief.update(seen(shifted, can)).invalid_moves == ()
+
+
 def test_a_class_that_shows_another_top_is_not_taken() -> None:
     can = resting("tomato_soup_can")
     assert pose_with_same_top(can, CLASSES["cracker_box"]) is None

@@ -1,20 +1,23 @@
 """Policy and planner systems with scripted inputs, and closed-loop episodes in Drake."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import DEFAULT_CELL, ONE_CUP, cell_with, resting, rng, scene_of
+from conftest import CLASSES, DEFAULT_CELL, ONE_CUP, cell_with, resting, rng, scene_of
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
 from drake_clutter.agents.explorers import largest_clear
+from drake_clutter.belief.class_belief import Touch, touch_likelihoods
+from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.work_cell import load_cell
 from drake_clutter.commands.run_scenario import load_or_generate_scene as scenario_scene
 from drake_clutter.commands.run_scenario import run_closed_loop, write_scenario_results
-from drake_clutter.config import ClutterConfig, ExplorationConfig, upgrade_config
+from drake_clutter.config import ClutterConfig, ExplorationConfig, TouchConfig, upgrade_config
 from drake_clutter.files import InputError
 from drake_clutter.planning.pick_place_plan import (
     PickPlacePlan,
@@ -63,9 +66,13 @@ def first_valid_move(
 class PolicyTestBench:
     """A policy system with scripted inputs."""
 
-    def __init__(self, max_grips: int = 1) -> None:
+    def __init__(self, max_grips: int = 1, classes: Sequence[ObjectClass] = ()) -> None:
         self.system = PolicySystem(
-            policy=first_valid_move, config=ExplorationConfig(), seed=0, max_grips=max_grips
+            policy=first_valid_move,
+            config=ExplorationConfig(),
+            seed=0,
+            max_grips=max_grips,
+            classes=classes,
         )
         self.simulator = Simulator(self.system)
         self.time = 0.0
@@ -104,6 +111,25 @@ def make_plan() -> PickPlacePlan:
     )
     assert isinstance(made, PickPlacePlan)
     return made
+
+
+def test_the_policy_weighs_what_the_gripper_felt() -> None:
+    """A box of 514 g hangs 2.5 mm low and touches 65 mm lower than believed: no cracker box."""
+    classes = [CLASSES["cracker_box"], CLASSES["sugar_box"]]
+    bench, plan = PolicyTestBench(classes=classes), make_plan()
+    state = bench.advance(0.1)
+    command = state.request.command
+    assert command is not None
+    gap = plan.X_TO_place.p[2] - command.X_TO_place.p[2] + ExplorationConfig().release_height
+    status = ExecutorStatus(1, felt_mass=0.514, bellows_extension=0.0025, has_touched=True)
+    lowered_distance = gap - 0.0025 + 0.065
+    bench.set_inputs(AFTER, PlanResponse(1, plan), 1, lowered_distance, status)
+    belief = bench.advance(0.1).belief
+    expected = touch_likelihoods(
+        COVERED["cracker_box"], Touch(0.514, -0.065), classes, TouchConfig()
+    )
+    assert belief.touch["cracker_box"] == pytest.approx(expected)
+    assert expected[classes[1]] > 10 * expected[classes[0]]
 
 
 def test_the_policy_waits_for_the_move_before_it_observes_again() -> None:

@@ -88,7 +88,7 @@ def touch_likelihoods(
                 for h in _heights_with_top_of(believed, c)
             )
         if not touch.has_sealed:
-            is_believed = c is believed.object_class
+            is_believed = c.name == believed.object_class.name
             likelihoods[c] *= (
                 config.no_seal_probability if is_believed else config.no_seal_otherwise
             )

@@ -102,11 +102,12 @@ def run_closed_loop(
     """
     policy = make_policy(scenario.agent, scenario.world, class_names(scene))
     until = StopCriterion(scenario.until)
+    catalog = load_catalog(Path(scenario.catalog) if scenario.catalog else None)
+    classes = catalog.smallest_set(class_names(scene))
     if until is StopCriterion.BELIEF:
-        catalog = load_catalog(Path(scenario.catalog) if scenario.catalog else None)
         policy = StoppingPolicy(
             policy,
-            catalog.smallest_set(class_names(scene)),
+            classes,
             render_empty_depth(scenario.world.cell.with_support(scene.support)),
             scenario.world.exploration.belief,
         )
@@ -117,6 +118,7 @@ def run_closed_loop(
         seed=scenario.seed,
         config=scenario.world,
         rate=DEFAULT_RATE,
+        classes=() if perceive is None else classes,
     )
     task = run_episode(
         closed_loop,

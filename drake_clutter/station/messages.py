@@ -4,6 +4,7 @@ A port always holds a message, because Drake does not accept None as an abstract
 stands for no message. A receiver acts on a message once, when its number changes.
 """
 
+import math
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -85,10 +86,17 @@ class ExecutorStatus(Message):
         number: Number of the plan.
         stage: Stage of the plan, see `CommandSchedule.stage_at`; "idle" if none is executed.
         has_no_seal: Whether no vacuum has built up at the grasp of the plan.
+        bellows_extension: Extension of the bellows before the guarded descent [m]; NaN without one.
+        felt_mass: Mass that stretched the bellows [kg]; NaN without a guarded descent, or if
+            nothing hung on them.
+        has_touched: Whether the guarded descent has ended by contact.
     """
 
     stage: str = "idle"
     has_no_seal: bool = False
+    bellows_extension: float = math.nan
+    felt_mass: float = math.nan
+    has_touched: bool = False
 
 
 def empty_observation() -> Observation:

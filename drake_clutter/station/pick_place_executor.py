@@ -16,6 +16,7 @@ from pydrake.systems.framework import (
 )
 
 from drake_clutter.cell.gripper import Payload
+from drake_clutter.cell.payload_limits import GRAVITY
 from drake_clutter.cell.suction import SuctionGripper
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.planning.arm_dynamics import arm_dynamics
@@ -309,4 +310,24 @@ class PickPlaceExecutor(LeafSystem):
         stage = "idle"
         if state.schedule is not None:
             stage = state.schedule.stage_at(state.elapsed(context.get_time()))
-        output.set_value(ExecutorStatus(state.number, stage, state.has_no_seal))
+        status = ExecutorStatus(
+            state.number,
+            stage,
+            state.has_no_seal,
+            state.bellows_extension,
+            self._felt_mass(state),
+            math.isfinite(state.contact_time),
+        )
+        output.set_value(status)
+
+    def _felt_mass(self, state: ExecutorState) -> float:
+        """Return the mass that stretched the bellows, see `ExecutorStatus` [kg]."""
+        gripper = self._cell.gripper
+        if (
+            not isinstance(gripper, SuctionGripper)
+            or not isinstance(state.plan, PickPlacePlan)
+            or not state.bellows_extension > MIN_BELLOWS_EXTENSION
+        ):
+            return math.nan
+        cup = gripper.cup(state.plan.tool)
+        return cup.stiffness * state.bellows_extension / GRAVITY - cup.mass

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydrake.systems.framework import DiagramBuilder
 
+from drake_clutter.catalog import ObjectClass
 from drake_clutter.config import ClutterConfig, ExplorationConfig
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.carry_clearance import CarryClearance
@@ -100,6 +101,7 @@ class ClosedLoop:
         config: ClutterConfig,
         planner_config: PlannerConfig | None = None,
         rate: float | None = None,
+        classes: Sequence[ObjectClass] = (),
     ) -> None:
         """Build the diagram around a scene at rest.
 
@@ -110,6 +112,8 @@ class ClosedLoop:
             config: Config of the cell, the simulation and the task.
             planner_config: Parameters of the planner; None: `default_planner_config`.
             rate: Recorded samples of motions per second [Hz]; None records nothing.
+            classes: Classes of the objects, between which the gripper's touch decides; none if
+                the detector is certain of them.
         """
         self.scene = scene
         self._perceive = perceive
@@ -128,6 +132,7 @@ class ClosedLoop:
             tracker=None if perceive is None else associate_detections,
             action_filter=InfeasibleMoveFilter(self._pickable, empty_depth, self.config),
             max_grips=planner_config.max_grips,
+            classes=classes,
         )
         self.planner_system = PlannerSystem(
             planner=self._planner,

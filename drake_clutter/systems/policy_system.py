@@ -1,11 +1,15 @@
 """Drake system that observes the scene, chooses a move, and waits until it is carried out."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, EventStatus, LeafSystem, State
 
+from drake_clutter.belief.class_belief import Touch, touch_likelihoods
+from drake_clutter.catalog import ObjectClass
 from drake_clutter.config import ExplorationConfig
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
 from drake_clutter.scenes.interfaces import MoveResult, Observation
@@ -102,6 +106,7 @@ class PolicySystem(LeafSystem):
         tracker: Tracker | None = None,
         action_filter: ActionFilter | None = None,
         max_grips: int = 1,
+        classes: Sequence[ObjectClass] = (),
         post_motion_wait: float = 0.5,
     ) -> None:
         """Create the system.
@@ -113,6 +118,8 @@ class PolicySystem(LeafSystem):
             tracker: Associates detections with known objects; None: their names are persistent.
             action_filter: Returns infeasible moves; None: every legal move is feasible.
             max_grips: Largest number of grasps of a move, see `PlannerConfig`.
+            classes: Classes of the objects, between which the gripper's touch decides; none if
+                the detector is certain of them.
             post_motion_wait: Time for objects to come to rest after a move [s].
         """
         super().__init__()
@@ -123,6 +130,7 @@ class PolicySystem(LeafSystem):
         self._tracker = tracker
         self._action_filter = action_filter
         self._max_grips = max_grips
+        self._classes = tuple(classes)
         self._observation = self.DeclareAbstractInputPort(
             "observation", AbstractValue.Make(empty_observation())
         )
@@ -167,7 +175,7 @@ class PolicySystem(LeafSystem):
         if not isinstance(response.plan, PickPlacePlan):
             has_tried = bool(now.request.tried)
             result = MoveResult.NOT_GRASPED if has_tried else MoveResult.NOT_PLANNED
-            belief = now.belief.record(move, result)
+            belief = self._record(context, now, result)
             return replace(now, phase=PolicyPhase.OBSERVING, observation_time=time, belief=belief)
         finished, lowered_distance = self._finished.Eval(context)
         if finished != now.request.number:
@@ -177,14 +185,62 @@ class PolicySystem(LeafSystem):
             if len(tried) < self._max_grips:
                 number = now.request.number + 1
                 return replace(now, request=replace(now.request, number=number, tried=tried))
-            belief = now.belief.record(move, MoveResult.NOT_GRASPED)
+            belief = self._record(context, now, MoveResult.NOT_GRASPED)
             return replace(now, phase=PolicyPhase.OBSERVING, observation_time=time, belief=belief)
-        X_TO = response.plan.X_TO_place.translated((0.0, 0.0, -lowered_distance))
-        belief = now.belief.record(move, MoveResult.PLACED, X_TO)
+        belief = self._record(context, now, MoveResult.PLACED, lowered_distance)
         observation_time = time + self._post_motion_wait
         return replace(
             now, phase=PolicyPhase.OBSERVING, observation_time=observation_time, belief=belief
         )
+
+    def _record(
+        self,
+        context: Context,
+        now: PolicyState,
+        result: MoveResult,
+        lowered_distance: float = 0.0,
+    ) -> Belief:
+        """Return the belief after the requested move, with what the gripper felt.
+
+        Args:
+            context: Context of the system.
+            now: State with the request.
+            result: Result of the move.
+            lowered_distance: By how much the object was released below its planned pose [m].
+        """
+        move = now.request.move
+        assert move is not None
+        X_TO_place = None
+        touch = Touch(has_sealed=result is not MoveResult.NOT_GRASPED)
+        plan = self._response.Eval(context).plan
+        if result is MoveResult.PLACED:
+            X_TO_place = plan.X_TO_place.translated((0.0, 0.0, -lowered_distance))
+            touch = self._touch(context, now, plan, lowered_distance)
+        picked = next(o for o in now.belief.objects if o.name == move.pick)
+        likelihoods = None
+        if self._classes and touch != Touch() and result is not MoveResult.NOT_PLANNED:
+            likelihoods = touch_likelihoods(picked, touch, self._classes, self._config.belief.touch)
+        return now.belief.record(move, result, X_TO_place, likelihoods)
+
+    def _touch(
+        self, context: Context, now: PolicyState, plan: PickPlacePlan, lowered_distance: float
+    ) -> Touch:
+        """Return what the gripper felt when it put an object down.
+
+        The object hung lower than planned by the extension of the bellows. It was planned to be
+        released `release_height` above what is below, or higher where the descent starts higher.
+        """
+        if not self._status.HasValue(context):
+            return Touch()
+        status: ExecutorStatus = self._status.Eval(context)
+        if math.isnan(status.felt_mass):
+            return Touch()
+        excess_height = math.nan
+        if status.has_touched and now.request.command is not None:
+            planned = plan.X_TO_place.translation[2] - now.request.command.X_TO_place.translation[2]
+            gap = planned + self._config.release_height
+            excess_height = gap - lowered_distance - status.bellows_extension
+        return Touch(status.felt_mass, excess_height)
 
     def _has_no_seal(self, context: Context) -> bool:
         """Return whether the executor has found no vacuum at the grasp of the latest plan."""

@@ -141,7 +141,10 @@ class Belief:
             felt = replace(self, touch={**self.touch, move.pick: product})
             return felt.record(move, result, X_TO_place)
         history = (*self.history, move)
-        if not result.was_executed or result is MoveResult.NOT_GRASPED:
+        if result is MoveResult.NOT_GRASPED:
+            ungrasped = tuple(o for o in self.objects if o.name == move.pick)
+            return replace(self, history=history, ungrasped=(*self.ungrasped, *ungrasped))
+        if not result.was_executed:
             return replace(self, history=history, invalid_moves=(*self.invalid_moves, move))
         if not result.is_at_placement or X_TO_place is None:
             return replace(self, history=history, invalid_moves=())
@@ -185,13 +188,13 @@ class Belief:
                 if np.linalg.norm(_top_center(seen) - top) > MAX_TOP_DISTANCE:
                     continue
                 revised = revise_class(d.object_class, d.class_probabilities, likelihoods)
-                if revised is d.object_class:
+                if revised.name == d.object_class.name:
                     X_TO: Pose | None = d.X_TO
                 else:
                     X_TO = pose_with_same_top(seen, revised)
                 if X_TO is not None:
                     detections[k] = replace(d, object_class=revised, X_TO=X_TO)
-                    if objects[name].object_class is not revised:
+                    if objects[name].object_class.name != revised.name:
                         objects[name] = replace(objects[name], object_class=revised, X_TO=X_TO)
         belief = replace(self, objects=tuple(objects.values()))
         return belief, replace(observation, detections=tuple(detections))
@@ -205,7 +208,8 @@ def _top_center(o: SceneObject) -> NDArray[np.float64]:
 def _is_same(detection: Detection, o: SceneObject) -> bool:
     """Return whether a detection is an object as it was believed."""
     distance = float(np.linalg.norm(detection.X_TO.p - o.X_TO.p))
-    return detection.object_class is o.object_class and distance < UNMOVED_TOLERANCE
+    is_same_class = detection.object_class.name == o.object_class.name
+    return is_same_class and distance < UNMOVED_TOLERANCE
 
 
 class Policy(Protocol):
