@@ -90,6 +90,13 @@ from .station.arm_executor import ArmExecutor as ArmExecutor
 from .station.clutter_station import ClutterStation as ClutterStation
 from .station.station_simulation import StationSimulation as StationSimulation
 from .feasibility.move_study import FeasibilityStudy as FeasibilityStudy
+from .feasibility.setups import (
+    SetupRequest as SetupRequest,
+    Sweep as Sweep,
+    sweep_setups as sweep_setups,
+)
+from .commands.feasibility_job import FeasibilityJob as FeasibilityJob
+from .commands.feasibility_run import run_feasibility_study as run_feasibility_study
 
 # Recorded episodes.
 from .recording.episode_recorder import record_episode as record_episode

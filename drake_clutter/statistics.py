@@ -1,6 +1,7 @@
 """Confidence intervals with a level of 95 %."""
 
-from collections.abc import Sequence
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,6 +81,48 @@ def ratio_interval(
         for extreme, quantile in zip((lowest, highest), QUANTILES, strict=True)
     )
     return low, high
+
+
+def quantile_interval(
+    samples: Sequence[Sequence[float]], quantile: float
+) -> tuple[float | None, float | None]:
+    """Return the interval of a quantile of values that come in independent samples.
+
+    It holds the values for which the interval of the share of smaller values contains the quantile
+    (Woodruff 1952); see `ratio_interval`.
+
+    Args:
+        samples: Values of each sample, which may depend on each other.
+        quantile: The quantile, between 0 and 1.
+
+    Returns:
+        The bounds; None where the samples are too few to tell one.
+    """
+    arrays = [np.sort(sample) for sample in samples if len(sample)]
+    if not arrays:
+        return None, None
+    totals = np.array([len(array) for array in arrays], float)
+    most = totals.max()
+    candidates = np.unique(np.concatenate(arrays))
+
+    def probability(value: float, extreme: float) -> float:
+        """Return that of a share below the quantile, with one more sample of an extreme share."""
+        counts = [np.searchsorted(array, value, side="right") for array in arrays]
+        excess = np.append(counts - quantile * totals, (extreme - quantile) * most)
+        scales, repeats = np.unique(excess, return_counts=True)
+        if scales[0] >= 0 or scales[-1] <= 0:
+            return float(scales[0] < 0)
+        return _negative_sum_probability(scales, repeats)
+
+    def first(is_past: Callable[[float], bool]) -> float | None:
+        """Return the smallest candidate that is past a bound, which all that follow are, too."""
+        k = bisect_left(candidates, True, key=is_past)
+        return float(candidates[k]) if k < len(candidates) else None
+
+    lower: float | None = None
+    if probability(-np.inf, 1.0) > QUANTILES[1]:
+        lower = first(lambda value: probability(value, 1.0) <= QUANTILES[1])
+    return lower, first(lambda value: probability(value, 0.0) < QUANTILES[0])
 
 
 def _weighted_ratio_quantile(

@@ -477,7 +477,7 @@ def cloning_training(folder: Path) -> Reader:
 
 
 def job_file(folder: Path) -> Reader:
-    job = feasibility_job(Path("scene.yaml")).to_dict()
+    job = feasibility_job(Path(__file__)).to_dict()
     with open_job_folder(folder, job):
         (folder / "moves.csv").touch()
 

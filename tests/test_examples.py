@@ -9,6 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from conftest import DEFAULT_CELL, resting, scene_of
+
+from drake_clutter import Verdict, save_scene
 
 ROOT = Path(__file__).parents[1]
 CASES = {
@@ -18,7 +21,7 @@ CASES = {
     "04_plan_arm_motion": [],
     "05_train_generator": ["--steps", "96", "--scenes", "2"],
     "06_command_arm": [],
-    "07_feasibility_study": ["--count", "1", "--workers", "1"],
+    "07_feasibility_study": [],
     "08_add_object_class": ["--nodes", "6"],
     "09_train_maskable_ppo": ["--steps", "1"],
     "10_own_objects": [],
@@ -45,6 +48,11 @@ def test_script_runs(name: str, tmp_path: Path) -> None:
         target.parent.mkdir(exist_ok=True)
         target.write_bytes(source.read_bytes())
     (tmp_path / "examples/own_objects").mkdir()
+    scenes = tmp_path / "out/scenes/scenes"
+    scenes.mkdir(parents=True)
+    scene = scene_of(resting("pudding_box"))
+    verdict = Verdict(None, scene.poses, dict.fromkeys(scene.names, 1.0), ())
+    save_scene(scenes / "0000.yaml", scene, DEFAULT_CELL, verdict)
     result = subprocess.run(
         [sys.executable, ROOT / "examples" / f"{name}.py", *CASES[name]],
         cwd=tmp_path,

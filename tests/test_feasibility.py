@@ -367,8 +367,10 @@ def test_a_summary_is_of_the_possible_moves() -> None:
     assert (a["impossible"], a["failures"]) == ({"no seal": 1}, {"unreachable": 1})
     assert (b["possible"], b["planned"], b["share"]) == (4, 2, 0.5)
     assert c["unusable"] == "no home"
-    assert a["cycle_s"] == {"median": 3.0, "p95": 3.0}
-    assert b["cycle_s"] == {"median": 4.0, "p95": 4.0}, "of the motions that are optimized"
+    unknown = {key: [None, None] for key in ("median_ci95", "p95_ci95")}
+    assert a["cycle_s"] == {"median": 3.0, "p95": 3.0} | unknown, "of two scenes only"
+    assert b["cycle_s"] == {"median": 4.0, "p95": 4.0} | unknown, "of the optimized motions"
+    assert b["failures_ci95"] == {"unreachable": share_interval([(0, 2), (2, 2)])}
     assert summary["ranking"] == ["a", "b"]
     (comparison,) = summary["comparisons"]
     assert comparison["possible_in_both"] == 3
@@ -380,7 +382,8 @@ def test_a_summary_is_of_the_possible_moves() -> None:
     assert first.startswith("a does 2 of the 3 moves that 2 scenes and its tools allow: 66.7 %")
     assert second == "Of its 1 failure, 1 are \u201cunreachable\u201d."
     assert third.endswith(
-        "b is next, 33.3 points behind: the data are compatible with no difference."
+        f"b is next, 33.3 points behind (95 % interval {100 * low:.1f} to {100 * high:.1f}): the "
+        "data are compatible with no difference."
     )
 
 
@@ -508,7 +511,7 @@ def test_a_study_from_the_command_line(
     assert summary["setups"][2]["unusable"] == "the base stands in the support"
     assert {*summary["ranking"]} == {*names[:2]}
     moves = table(out / "moves.csv")
-    assert tuple(moves[0]) == MOVE_RECORD_FIELDS
+    assert [*moves[0]] == [*MOVE_RECORD_FIELDS]
     for setup in summary["setups"][:2]:
         rows = [row for row in moves if row["setup"] == setup["name"]]
         possible = [row for row in rows if row["possible"] == "True"]
@@ -566,7 +569,9 @@ def test_a_killed_study_is_finished_by_any_number_of_processes(
                     raise KeyboardInterrupt
                 yield part
 
-        return feasibility_run.run_feasibility_study(job, tmp_path / name, workers, progress)
+        return feasibility_run.run_feasibility_study(
+            job, tmp_path / name, workers=workers, progress=progress
+        )
 
     whole = run("whole", 1, math.inf)
     with pytest.raises(KeyboardInterrupt):

@@ -234,10 +234,10 @@ def test_a_capsule_over_a_box() -> None:
         placed = np.array([[end, end + np.array([0.3, 0.0, 0.0])]])
         c, s = math.cos(yaw), math.sin(yaw)
         placed[..., :2] = placed[..., :2] @ np.array([[c, -s], [s, c]])  # in the turned base
-        fields = tops.first, tops.owners, tops.second, tops.corner
         base = np.array([0.0, 0.0, 0.4, yaw])
+        arrays = tuple(vars(tops).values())
         return bool(
-            collides_with_objects(placed, radii, base, *fields, np.array([may_touch]), picked)
+            collides_with_objects(placed, radii, base, arrays, np.array([may_touch]), picked)
         )
 
     for yaw in (0.0, 1.0):

@@ -12,7 +12,7 @@ from drake_clutter.files import InputError
 
 
 def job(seed: int = 0) -> dict[str, Any]:
-    return feasibility_job(Path("/scene.yaml"), seed).to_dict()
+    return feasibility_job(Path(__file__), seed).to_dict()
 
 
 def test_the_same_job_is_resumed_and_another_refused(tmp_path: Path) -> None:

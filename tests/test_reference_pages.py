@@ -12,6 +12,7 @@ from test_floors import FLOORS
 from drake_clutter import ClutterConfig, run_episode
 from drake_clutter.agents.explorers import random_explorer
 from drake_clutter.commands.explore_scene import episode_to_dict
+from drake_clutter.commands.feasibility_run import BASE_COLUMNS, MAP_COLUMNS, TARGET_COLUMNS
 from drake_clutter.feasibility.move_study import MOVE_RECORD_FIELDS
 from drake_clutter.feasibility.pose_noise import NOISE_RECORD_FIELDS
 from drake_clutter.feasibility.sequences import SEQUENCE_RECORD_FIELDS
@@ -82,6 +83,9 @@ def test_feasibility_study() -> None:
     assert first_column(page, "### `moves.csv`") == [*MOVE_RECORD_FIELDS]
     assert first_column(page, "### `noise.csv`") == [*NOISE_RECORD_FIELDS]
     assert first_column(page, "### `sequences.csv`") == [*SEQUENCE_RECORD_FIELDS]
+    assert first_column(page, "### `reach.csv`") == [*MAP_COLUMNS]
+    assert first_column(page, "### `bases.csv`") == [*BASE_COLUMNS]
+    assert first_column(page, "### `targets.csv`") == [*TARGET_COLUMNS]
 
 
 def test_planning_failures() -> None:

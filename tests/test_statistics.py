@@ -11,7 +11,12 @@ from conftest import rng
 from scipy.stats import binomtest, multinomial, sem, t
 
 from drake_clutter.resources import resource_path
-from drake_clutter.statistics import mean_interval, ratio_interval, wilson_interval
+from drake_clutter.statistics import (
+    mean_interval,
+    quantile_interval,
+    ratio_interval,
+    wilson_interval,
+)
 
 
 @pytest.mark.parametrize(
@@ -113,3 +118,30 @@ def test_intervals_of_shipped_results_are_reproduced() -> None:
             successes = round(recall["recall"] * recall["objects"])
             interval = wilson_interval(successes, recall["objects"])
             assert interval == pytest.approx(recall["ci95"], rel=0, abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("count", "quantile", "low", "high"),
+    [
+        # Conover 1999, Practical Nonparametric Statistics, section 3.2: ranks from binomial tails.
+        (20, 0.5, 6, 15),
+        (6, 0.5, 1, 6),
+        (5, 0.5, None, None),
+        (100, 0.95, 90, 100),
+        (59, 0.95, 52, None),
+    ],
+)
+def test_interval_of_a_quantile_is_that_of_order_statistics(
+    count: int, quantile: float, low: int | None, high: int | None
+) -> None:
+    values = rng(2).permutation(np.arange(1, count + 1)).tolist()
+    assert quantile_interval([[value] for value in values], quantile) == (low, high)
+
+
+def test_interval_of_a_quantile_takes_samples_as_wholes() -> None:
+    """Equal values of a sample tell no more than one of them, opposite ones more."""
+    once = quantile_interval([[k] for k in range(20)], 0.5)
+    assert quantile_interval([[k, k, k] for k in range(20)], 0.5) == once
+    # Of the six samples from 7 to 12 all values are on one side: 1 / 2^6 < 0.025 < 1 / 2^4.
+    assert quantile_interval([[k, 19 - k] for k in range(20)], 0.5) == (7, 12)
+    assert quantile_interval([], 0.5) == quantile_interval([[]], 0.5) == (None, None)

@@ -184,6 +184,6 @@ def feasibility(
     def progress(parts: Iterable[Any], num_done: int, total: int) -> Iterable[Any]:
         return progress_bar("parts of the study", parts, num_done, total)
 
-    summary = run_feasibility_study(job, out, workers, progress, ray)
+    summary = run_feasibility_study(job, out, workers=workers, ray_address=ray, progress=progress)
     rows = describe_feasibility(summary) | {"report": str(out / REPORT_FILE)}
     print_result(summary, rows, as_json, f"{out}")

@@ -3,7 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from drake_clutter.cell.pose_spec import PoseSpec
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.config import ClutterConfig, upgrade_cell
 from drake_clutter.feasibility.setups import SetupRequest, Sweep
-from drake_clutter.files import InputError
+from drake_clutter.files import InputError, file_sha256
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.scene import Pose
 from drake_clutter.validation import (
@@ -62,15 +62,15 @@ class FeasibilityJob:
 
     scenes: tuple[Path, ...]
     setups: Mapping[str, SetupRequest]
-    searches: tuple[Sweep, ...]
-    targets: tuple[TargetPose, ...]
-    draws_maps: bool
-    noisy_moves: int
-    agent: str | None
-    simulate: bool
-    seed: int
-    config: ClutterConfig
-    catalog_folder: Path | None
+    searches: tuple[Sweep, ...] = ()
+    targets: tuple[TargetPose, ...] = ()
+    draws_maps: bool = True
+    noisy_moves: int = 0
+    agent: str | None = None
+    simulate: bool = False
+    seed: int = 0
+    config: ClutterConfig = field(default_factory=ClutterConfig)
+    catalog_folder: Path | None = None
 
     @property
     def reference(self) -> WorkCell:
@@ -80,7 +80,7 @@ class FeasibilityJob:
     def to_dict(self) -> dict[str, Any]:
         """Return the job as a JSON document."""
         return {
-            "scenes": [str(path.resolve()) for path in self.scenes],
+            "scenes": {str(path.resolve()): file_sha256(path) for path in self.scenes},
             "setups": {name: to_plain(setup.cell) for name, setup in self.setups.items()},
             "searched_homes": [n for n, setup in self.setups.items() if not setup.keep_home],
             "searches": [asdict(search) for search in self.searches],

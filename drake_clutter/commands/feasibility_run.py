@@ -34,11 +34,23 @@ from drake_clutter.workers.parallel_map import map_ordered
 
 PARTS_FOLDER = "parts"
 REPORT_FILE = "report.html"
-_MAP_COLUMNS = ("setup", "tilt_deg", "height", "x", "y", "reachable_fraction", "singular_value")
-_BASE_COLUMNS = ("settings", "x", "y", "z", "yaw", "possible", "reachable")
-_TARGET_COLUMNS = (
-    *("setup", "target", "num_solutions", "reachable", "singular_value", "obstacles"),
-)
+MAP_COLUMNS = {
+    "setup": str,
+    **dict.fromkeys(("tilt_deg", "height", "x", "y"), float),
+    **dict.fromkeys(("reachable_fraction", "singular_value"), float),
+}
+"""Columns of `reach.csv`, with their types."""
+BASE_COLUMNS = {
+    "settings": str,
+    **dict.fromkeys(("x", "y", "z", "yaw"), float),
+    **dict.fromkeys(("possible", "reachable"), int),
+}
+"""Columns of `bases.csv`, with their types."""
+TARGET_COLUMNS = {
+    **{"setup": str, "target": str, "num_solutions": int, "reachable": bool},
+    **{"singular_value": float, "obstacles": str},
+}
+"""Columns of `targets.csv`, with their types."""
 
 Progress = Callable[[Iterable[Any], int, int], Iterable[Any]]
 """Wraps results to show progress, given how many exist already and how many there will be."""
@@ -137,12 +149,17 @@ def _base_rows(grid: BaseGrid, possible: int, reachable: Sequence[int]) -> list[
     ]
 
 
+def _show_nothing(parts: Iterable[Any], num_done: int, total: int) -> Iterable[Any]:
+    return parts
+
+
 def run_feasibility_study(
     job: FeasibilityJob,
     out: Path,
-    workers: int,
-    progress: Progress,
+    *,
+    workers: int = 1,
     ray_address: str | None = None,
+    progress: Progress = _show_nothing,
 ) -> dict[str, Any]:
     """Compute the missing parts of a study; write tables, `summary.json` and `report.html`.
 
@@ -150,11 +167,11 @@ def run_feasibility_study(
         job: The study.
         out: Output folder: new, empty, or of the same job.
         workers: Number of worker processes.
-        progress: Shows progress.
         ray_address: Address of the Ray cluster that runs the workers; None runs them locally.
+        progress: Shows progress.
 
     Returns:
-        The summary.
+        The summary, the content of `summary.json`.
 
     Raises:
         InputError: A scene file cannot be used, or the folder holds other results.
@@ -231,9 +248,9 @@ def _write_results(
     for name, rows, columns in (
         ("noise", noise, NOISE_RECORD_FIELDS),
         ("sequences", sequences, SEQUENCE_RECORD_FIELDS),
-        ("reach", _map_rows(maps), _MAP_COLUMNS),
-        ("bases", bases, _BASE_COLUMNS),
-        ("targets", targets, _TARGET_COLUMNS),
+        ("reach", _map_rows(maps), MAP_COLUMNS),
+        ("bases", bases, BASE_COLUMNS),
+        ("targets", targets, TARGET_COLUMNS),
     ):
         if rows:
             write_table(out / name, rows, columns)

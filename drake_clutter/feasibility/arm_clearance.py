@@ -44,6 +44,7 @@ class ArmGeometry:
         lengths: Denavit-Hartenberg parameters d1, a2, a3, d4, d5, d6 [m]. Shape (6,).
         X_0B: Pose of the base in frame 0. Shape (4, 4).
         X_G6: Pose of frame 6 in the tool. Shape (4, 4).
+        limits: Position limits of the joints [rad]. Shape (n, 2).
         depths: Number of joints that move each capsule. Shape (c,).
         ends: Ends of their axes in J [m]. Shape (c, 2, 3).
         radii: Radii of the capsules [m]. Shape (c,).
@@ -55,6 +56,7 @@ class ArmGeometry:
     lengths: Floats
     X_0B: Floats
     X_G6: Floats
+    limits: Floats
     depths: Integers
     ends: Floats
     radii: Floats
@@ -66,11 +68,16 @@ class ArmGeometry:
         """Return the geometry of an arm without inverse kinematics in closed form."""
         X = np.empty((0, 4, 4))
         none = np.empty(0, np.int64)
-        ends = np.empty((0, 2, 3))
         none_of_tool, pairs = np.empty(0, bool), none.reshape(0, 2)
         return ArmGeometry(
-            X, np.empty(0), X[:, 0], X[:, 0], none, ends, np.empty(0), none_of_tool, pairs
+            *(X, np.empty(0), X[:, 0], X[:, 0], np.empty((0, 2))),
+            *(none, np.empty((0, 2, 3)), np.empty(0), none_of_tool, pairs),
         )
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the arm has inverse kinematics in closed form."""
+        return len(self.limits) > 0
 
     @staticmethod
     def from_model(
@@ -104,6 +111,7 @@ class ArmGeometry:
             np.array([d[0], a[1], a[2], d[3], d[4], d[5]]),
             np.eye(4) if ik.X_0B is None else ik.X_0B,
             X_GF if ik.X_F6 is None else X_GF @ ik.X_F6,
+            kinematics.robot.position_limits,
             capsules.depths,
             capsules.ends,
             capsules.radii,
@@ -122,12 +130,14 @@ class ObstacleTops:
         owners: Index of the object that determines it; -1 for walls. Shape (k, n_x, n_y).
         second: Height without this object [m]. Shape (k, n_x, n_y).
         corner: x and y of the first grid point in T [m]. Shape (2,).
+        highest: Greatest height for each radius [m]. Shape (k,).
     """
 
     first: Floats
     owners: Integers
     second: Floats
     corner: Floats
+    highest: Floats
 
     @staticmethod
     def from_scene(scene: Scene, radii: Floats) -> "ObstacleTops":
@@ -150,7 +160,7 @@ class ObstacleTops:
         for owner, xy, top in solids:
             outline = xy[ConvexHull(xy).vertices]  # counter-clockwise
             _raise_tops(outline, top, owner, radii, corner, first, owners, second)
-        return ObstacleTops(first, owners, second, corner)
+        return ObstacleTops(first, owners, second, corner, first.max(axis=(1, 2)))
 
 
 @njit(cache=True, nogil=True)
@@ -276,23 +286,32 @@ def _squared_distance(A, B):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def collides_with_objects(placed, radii, base, first, owners, second, corner, may_touch, picked):  # type: ignore[no-untyped-def]
+def lowest_point(placed, radii):  # type: ignore[no-untyped-def]
+    """Return the height in B of the lowest point of capsules [m]."""
+    lowest = np.inf
+    for k in range(len(radii)):
+        lowest = min(lowest, placed[k, 0, 2] - radii[k], placed[k, 1, 2] - radii[k])
+    return lowest
+
+
+@njit(cache=True, nogil=True)
+def collides_with_objects(placed, radii, base, tops, may_touch, picked):  # type: ignore[no-untyped-def]
     """Return whether a capsule is in an object or a wall.
 
     Args:
         placed: Ends of the capsules in B [m]. Shape (c, 2, 3).
         radii: Their radii [m]. Shape (c,).
         base: x, y, z [m] and yaw [rad] of the base.
-        first: See `ObstacleTops`; as the three that follow.
-        owners: See `ObstacleTops`.
-        second: See `ObstacleTops`.
-        corner: See `ObstacleTops`.
+        tops: Arrays of `ObstacleTops`.
         may_touch: Whether the object does not count for a capsule. Shape (c,).
         picked: Index of the object.
     """
+    first, owners, second, corner, highest = tops
     c, s = np.cos(base[3]), np.sin(base[3])
     _, num_x, num_y = first.shape
     for k in range(len(radii)):
+        if min(placed[k, 0, 2], placed[k, 1, 2]) + base[2] >= highest[k]:
+            continue
         length = 0.0
         for i in range(3):
             length += (placed[k, 1, i] - placed[k, 0, i]) ** 2

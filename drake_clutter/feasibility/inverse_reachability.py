@@ -26,6 +26,7 @@ from drake_clutter.feasibility.arm_clearance import (
     ObstacleTops,
     collides_with_itself,
     collides_with_objects,
+    lowest_point,
     place_capsules,
     solve_downward,
 )
@@ -96,13 +97,11 @@ class InverseReachabilityMap:
         Returns:
             Whether each move is reachable from each base. Shape (m, k).
         """
-        arm = self.arm
         return np.asarray(
             _find_reachable(
                 (self.solutions, self.lowest, self.turns, self.turn_limits, self.heights[0]),
-                (arm.fixed, arm.lengths, arm.X_0B, arm.X_G6),
-                (arm.depths, arm.ends, arm.radii, arm.may_touch, arm.pairs),
-                (tops.first, tops.owners, tops.second, tops.corner),
+                tuple(getattr(self.arm, field.name) for field in fields(ArmGeometry)),
+                tuple(getattr(tops, field.name) for field in fields(ObstacleTops)),
                 (moves.poses, moves.starts, moves.picked),
                 np.ascontiguousarray(bases, float),
                 table_height + PlannerConfig().min_distance,
@@ -315,8 +314,27 @@ def build_inverse_reachability(cell: WorkCell, tool_name: str) -> InverseReachab
             found[cell_index] |= 1 << bit
             if height > lowest[*cell_index, bit]:
                 lowest[*cell_index, bit], turns[*cell_index, bit] = height, turn
-    arm = ArmGeometry.from_model(tool, cell.gripper.tools[tool_name], model, close_pairs)
+    arm = ArmGeometry.from_model(
+        ToolKinematics(cell, tool_name), cell.gripper.tools[tool_name], model, close_pairs
+    )
+    if arm.is_exact:
+        # The exact pose decides: no branch may be missing that a neighbor has.
+        found = _dilate(found)
     return InverseReachabilityMap(heights, found, lowest, turns, turn_limits, arm)
+
+
+def _dilate(solutions: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the bits of each point of a map and of its neighbors."""
+    for axis in range(3):
+        pad = np.zeros_like(solutions.take([0], axis))
+        before, after = np.split(solutions, [1], axis)[1], np.split(solutions, [-1], axis)[0]
+        ends = (solutions.take([0], axis), solutions.take([-1], axis)) if axis == 2 else (pad, pad)
+        solutions = (
+            solutions
+            | np.concatenate([before, ends[0]], axis)
+            | np.concatenate([ends[1], after], axis)
+        )
+    return solutions
 
 
 @njit(cache=True, nogil=True)
@@ -326,18 +344,64 @@ def _is_within(turn, lower, upper):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _find_reachable(grid, kinematics, capsules, tops, moves, bases, table, gap):  # type: ignore[no-untyped-def]
+def _is_reached_exactly(points, branch, arm, tops, base, table, gap, picked, work):  # type: ignore[no-untyped-def]
+    """Return whether a branch reaches the points of a move without collision.
+
+    Between the points above the grasp and the place the arm moves on a straight line in joint
+    space; its middle is checked.
+
+    Args:
+        points: x, y, z [m] and yaw [rad] of the tool in B at the grasp, above it, above the place
+            and at the place. Shape (4, 4).
+        branch: Branch of the inverse kinematics.
+        arm: Arrays of `ArmGeometry`.
+        tops: Arrays of `ObstacleTops`.
+        base: x, y, z [m] and yaw [rad] of the base.
+        table: Smallest height of the links in T [m].
+        gap: Smallest distance of links from each other [m].
+        picked: Index of the picked object.
+        work: Arrays for intermediate results.
+    """
+    fixed, lengths, X_0B, X_G6, limits, depths, ends, radii, may_touch, pairs = arm
+    X, q, revolute, frames, moved, placed, ignores = work
+    for point in (0, 3, 1, 2):
+        if not solve_downward(lengths, X_0B, X_G6, points[point], branch, X, q[point]):
+            return False
+        for joint in range(len(limits)):
+            if not _is_within(q[point, joint], limits[joint, 0], limits[joint, 1]):
+                return False
+    for joint in range(len(limits)):
+        change = q[2, joint] - q[1, joint]
+        if limits[joint, 1] - limits[joint, 0] > 2 * np.pi:
+            change -= 2 * np.pi * np.floor(change / (2 * np.pi) + 0.5)
+        q[4, joint] = q[1, joint] + change / 2
+    # The grasp and the place first, where the arm is lowest.
+    for point in (0, 3, 4, 1, 2):
+        place_capsules(fixed, revolute, depths, ends, q[point], frames, moved, placed)
+        if lowest_point(placed, radii) + base[2] < table:
+            return False
+        if collides_with_itself(placed, radii, pairs, gap):
+            return False
+        # At the place the picked object is no longer where it was.
+        if (point == 0 or point == 3) and collides_with_objects(
+            placed, radii, base, tops, may_touch if point == 0 else ignores, picked
+        ):
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _find_reachable(grid, arm, tops, moves, bases, table, gap):  # type: ignore[no-untyped-def]
     """Return whether each move is reachable from each base, shape (m, k).
 
-    A move is reachable if one branch reaches the grasp, the place, the two points above them and
-    the one halfway between these, with the links above the table. For arms with inverse kinematics
-    in closed form, the solution at the exact pose must be clear of itself, and at the grasp and the
-    place of the objects.
+    A move is reachable if one branch reaches the grasp, the place, the points above them and what
+    is between these. For arms with inverse kinematics in closed form, the map says which branches
+    come into question, and the solutions at the exact poses decide. For others it is the map with
+    the point halfway, and links above the table.
 
     Args:
         grid: Arrays of the map, and its first height.
-        kinematics: Arrays of `ArmGeometry` for the inverse kinematics.
-        capsules: Arrays of `ArmGeometry` for the clearances.
+        arm: Arrays of `ArmGeometry`.
         tops: Arrays of `ObstacleTops`.
         moves: Arrays of `MovePoses`.
         bases: x, y, z [m] and yaw [rad] of the bases. Shape (m, 4).
@@ -345,48 +409,58 @@ def _find_reachable(grid, kinematics, capsules, tops, moves, bases, table, gap):
         gap: Smallest distance of links from each other [m].
     """
     solutions, lowest, turns, turn_limits, first_height = grid
-    fixed, lengths, X_0B, X_G6 = kinematics
-    depths, ends, radii, may_touch, pairs = capsules
-    ignores = np.ones(len(depths), np.bool_)
-    first, owners, second, corner = tops
     poses, starts, picked = moves
-    is_exact = len(lengths) > 0
+    num_joints, num_capsules = len(arm[4]), len(arm[5])
+    is_exact = num_joints > 0
+    num_points = 4 if is_exact else 5
     num_radii, num_heights, num_yaws = solutions.shape
     found = np.zeros((len(bases), len(starts) - 1), np.bool_)
-    n = max(len(fixed) - 1, 0)
-    revolute = np.ones(n, np.bool_)
-    frames, moved = np.empty((n + 1, 4, 4)), np.empty((n, 3, 4))
-    placed = np.empty((len(depths), 2, 3))
-    points = np.empty((5, 4))
-    X, q = np.empty((2, 4, 4)), np.empty(6)
+    work = (
+        np.empty((2, 4, 4)),
+        np.empty((5, num_joints)),
+        np.ones(num_joints, np.bool_),
+        np.empty((num_joints + 1, 4, 4)),
+        np.empty((num_joints, 3, 4)),
+        np.empty((num_capsules, 2, 3)),
+        np.ones(num_capsules, np.bool_),
+    )
+    points = np.empty((4, 4))
     for b in range(len(bases)):
         x, y, z, base_yaw = bases[b]
         c, sine = np.cos(base_yaw), np.sin(base_yaw)
         for move in range(len(starts) - 1):
             for row in range(starts[move], starts[move + 1]):
-                turn = poses[row, 5] - poses[row, 2]
-                turn -= 2 * np.pi * np.floor(turn / (2 * np.pi) + 0.5)
                 common = np.int64(255)
-                # The grasp and the point above it, halfway, the point above the place, the place.
-                for point in range(5):
-                    s = min(max((point - 1) / 2, 0.0), 1.0)
-                    dx = (1 - s) * poses[row, 0] + s * poses[row, 3] - x
-                    dy = (1 - s) * poses[row, 1] + s * poses[row, 4] - y
-                    yaw = poses[row, 2] + s * turn
-                    azimuth = np.arctan2(dy, dx)
+                # The grasp and the point above it, the point above the place, the place, halfway.
+                for point in range(num_points):
+                    if point == 4:
+                        turn = poses[row, 5] - poses[row, 2]
+                        turn -= 2 * np.pi * np.floor(turn / (2 * np.pi) + 0.5)
+                        dx = (poses[row, 0] + poses[row, 3]) / 2 - x
+                        dy = (poses[row, 1] + poses[row, 4]) / 2 - y
+                        yaw = poses[row, 2] + turn / 2
+                    else:
+                        end = 0 if point < 2 else 3
+                        dx, dy = poses[row, end] - x, poses[row, end + 1] - y
+                        yaw = poses[row, end + 2]
                     height = poses[row, 8]
                     if point == 0:
                         height = poses[row, 6]
-                    elif point == 4:
+                    elif point == 3:
                         height = poses[row, 7]
-                    points[point, 0], points[point, 1] = c * dx + sine * dy, c * dy - sine * dx
-                    points[point, 2], points[point, 3] = height - z, yaw - base_yaw
+                    azimuth = np.arctan2(dy, dx)
                     i = int(np.sqrt(dx * dx + dy * dy) / SPACING + 0.5)
                     k = int(np.floor((yaw - azimuth) / (2 * np.pi) * num_yaws + 0.5)) % num_yaws
                     j = int(np.floor((height - z - first_height) / SPACING + 0.5))
                     usable = np.int64(0)
                     if i < num_radii and 0 <= j < num_heights:
                         usable = np.int64(solutions[i, j, k])
+                    if is_exact:
+                        points[point, 0] = c * dx + sine * dy
+                        points[point, 1] = c * dy - sine * dx
+                        points[point, 2], points[point, 3] = height - z, yaw - base_yaw
+                        common &= usable
+                    else:
                         for bit in range(8):
                             if usable >> bit & 1 and (
                                 lowest[i, j, k, bit] + z < table
@@ -397,42 +471,18 @@ def _find_reachable(grid, kinematics, capsules, tops, moves, bases, table, gap):
                                 )
                             ):
                                 usable ^= 1 << bit
-                    common = common & usable if is_exact else usable
+                        common = usable
                     if common == 0:
                         break
-                if common == 0:
-                    continue
                 if not is_exact:
-                    found[b, move] = True
-                    break
-                for bit in range(8):
-                    is_clear = common >> bit & 1 == 1
-                    # The grasp and the place first, where the arm is lowest.
-                    for point in (0, 4, 2, 1, 3):
-                        if not is_clear:
+                    found[b, move] = common != 0
+                else:
+                    for bit in range(8):
+                        if common >> bit & 1 and _is_reached_exactly(
+                            points, bit, arm, tops, bases[b], table, gap, picked[move], work
+                        ):
+                            found[b, move] = True
                             break
-                        is_clear = solve_downward(lengths, X_0B, X_G6, points[point], bit, X, q)
-                        if not is_clear:
-                            break
-                        place_capsules(fixed, revolute, depths, ends, q, frames, moved, placed)
-                        if collides_with_itself(placed, radii, pairs, gap):
-                            is_clear = False
-                        elif point == 0 or point == 4:
-                            # At the place the picked object is no longer where it was.
-                            is_clear = not collides_with_objects(
-                                placed,
-                                radii,
-                                bases[b],
-                                first,
-                                owners,
-                                second,
-                                corner,
-                                may_touch if point == 0 else ignores,
-                                picked[move],
-                            )
-                    if is_clear:
-                        found[b, move] = True
-                        break
                 if found[b, move]:
                     break
     return found

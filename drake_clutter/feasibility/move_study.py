@@ -132,8 +132,8 @@ class MoveRecord:
     tool: str = ""
 
 
-MOVE_RECORD_FIELDS = tuple(field.name for field in fields(MoveRecord))
-"""Columns of `moves.csv`."""
+MOVE_RECORD_FIELDS = {field.name: field.type for field in fields(MoveRecord)}
+"""Columns of `moves.csv`, with their types."""
 
 
 @dataclass(frozen=True)

@@ -81,8 +81,8 @@ class NoiseRecord:
     detail: str
 
 
-NOISE_RECORD_FIELDS = tuple(field.name for field in fields(NoiseRecord))
-"""Columns of `noise.csv`."""
+NOISE_RECORD_FIELDS = {field.name: field.type for field in fields(NoiseRecord)}
+"""Columns of `noise.csv`, with their types."""
 
 
 class NoiseStudy:

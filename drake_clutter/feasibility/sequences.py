@@ -49,8 +49,8 @@ class SequenceRecord:
     ended: str
 
 
-SEQUENCE_RECORD_FIELDS = tuple(field.name for field in fields(SequenceRecord))
-"""Columns of `sequences.csv`."""
+SEQUENCE_RECORD_FIELDS = {field.name: field.type for field in fields(SequenceRecord)}
+"""Columns of `sequences.csv`, with their types."""
 
 
 class PlannedExecutor:

@@ -39,7 +39,7 @@ class SetupRequest:
     """
 
     cell: WorkCell
-    keep_home: bool
+    keep_home: bool = True
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 from drake_clutter.feasibility.move_study import PLANNED
 from drake_clutter.feasibility.setups import Setup, UnusableSetup
 from drake_clutter.scenes.interfaces import MoveResult
-from drake_clutter.statistics import ratio_interval, wilson_interval
+from drake_clutter.statistics import quantile_interval, ratio_interval, wilson_interval
 from drake_clutter.tasks.exploration_task import TerminationReason
 
 Row = Mapping[str, Any]
@@ -22,8 +22,14 @@ Row = Mapping[str, Any]
 
 MAX_ALL_PAIRS = 12
 """Number of setups up to which all pairs are compared; more are compared with the best one."""
-MARGIN_QUANTILES = {"smallest": 0.0, "p05": 0.05, "median": 0.5}
-"""Quantiles of the margins over the planned moves."""
+_SMALLEST = {"smallest": 0.0, "p05": 0.05, "median": 0.5}
+_LARGEST = {"median": 0.5, "p95": 0.95, "largest": 1.0}
+MARGIN_QUANTILES = {
+    **dict.fromkeys(("clearance", "joint_margin", "singular_value", "manipulability"), _SMALLEST),
+    **dict.fromkeys(("torque_share", "load_share"), _LARGEST),
+}
+"""Quantiles of each margin over the planned moves."""
+_DURATION_QUANTILES = {"median": 0.5, "p95": 0.95}
 GROUP_KEYS: dict[str, Callable[[Row], str]] = {
     "object_class": lambda row: row["object_class"],
     "resting_side": lambda row: row["resting_side"],
@@ -121,11 +127,12 @@ def share_interval(
     return ratio_interval(numerators, denominators, (lowest * most, most), (most, most))
 
 
-def _counts_by_scene(moves: Sequence[Row]) -> list[tuple[int, int]]:
-    """Return the numbers of planned and of possible moves of each scene."""
-    possible = Counter(row["scene"] for row in moves if row["possible"])
-    planned = Counter(row["scene"] for row in moves if row["result"] == PLANNED)
-    return [(planned[scene], total) for scene, total in possible.items()]
+def count_by_scene(moves: Iterable[Row], result: str) -> list[tuple[int, int]]:
+    """Return the numbers of moves with a result and of all moves, of each scene."""
+    rows = [*moves]
+    total = Counter(row["scene"] for row in rows)
+    found = Counter(row["scene"] for row in rows if row["result"] == result)
+    return [(found[scene], count) for scene, count in total.items()]
 
 
 def _summarize_setup(
@@ -137,6 +144,7 @@ def _summarize_setup(
     """Return the statistics of one setup from its rows."""
     possible = [row for row in moves if row["possible"]]
     planned = [row for row in possible if row["result"] == PLANNED]
+    failures = _count_results(row for row in possible if row["result"] != PLANNED)
     # Only some of the motions are optimized.
     optimized = [row for row in planned if math.isfinite(row["cycle_s"] or math.nan)]
     return {
@@ -149,9 +157,12 @@ def _summarize_setup(
         "possible": len(possible),
         "planned": len(planned),
         "share": len(planned) / len(possible) if possible else None,
-        "share_ci95": share_interval(_counts_by_scene(moves)),
+        "share_ci95": share_interval(count_by_scene(possible, PLANNED)),
         "impossible": _count_results(row for row in moves if not row["possible"]),
-        "failures": _count_results(row for row in possible if row["result"] != PLANNED),
+        "failures": failures,
+        "failures_ci95": {
+            result: share_interval(count_by_scene(possible, result)) for result in failures
+        },
         "groups": {
             group: {
                 value: {"possible": count, "planned": sum(key(row) == value for row in planned)}
@@ -159,16 +170,10 @@ def _summarize_setup(
             }
             for group, key in GROUP_KEYS.items()
         },
-        "cycle_s": _quantiles(optimized, "cycle_s", {"median": 0.5, "p95": 0.95}),
+        "cycle_s": _quantiles(optimized, "cycle_s", _DURATION_QUANTILES),
         "margins": {
-            "clearance": _quantiles(planned, "clearance", MARGIN_QUANTILES),
-            "joint_margin": _quantiles(planned, "joint_margin", MARGIN_QUANTILES),
-            "singular_value": _quantiles(planned, "singular_value", MARGIN_QUANTILES),
-            "manipulability": _quantiles(planned, "manipulability", MARGIN_QUANTILES),
-            **{
-                name: _quantiles(planned, name, {"median": 0.5, "p95": 0.95, "largest": 1.0})
-                for name in ("torque_share", "load_share")
-            },
+            name: _quantiles(planned, name, quantiles)
+            for name, quantiles in MARGIN_QUANTILES.items()
         },
         "noise": [
             _summarize_noise(kind, size, rows) for (kind, size), rows in _group_noise(noise).items()
@@ -181,14 +186,29 @@ def _count_results(moves: Iterable[Row]) -> dict[str, int]:
     return dict(Counter(row["result"] for row in moves).most_common())
 
 
-def _quantiles(
-    moves: Sequence[Row], column: str, quantiles: Mapping[str, float]
-) -> dict[str, float | None]:
-    """Return quantiles of a column; distances that are not computed count as infinite."""
-    values = [math.inf if row[column] is None else row[column] for row in moves]
-    found = np.quantile(values, [*quantiles.values()], method="lower") if values else ()
-    finite = [float(value) if math.isfinite(value) else None for value in found]
-    return dict(zip(quantiles, finite, strict=True)) if finite else dict.fromkeys(quantiles)
+def _quantiles(moves: Sequence[Row], column: str, quantiles: Mapping[str, float]) -> dict[str, Any]:
+    """Return quantiles of a column; distances that are not computed count as infinite.
+
+    All but the extremes have an interval, with the scenes as the sample.
+    """
+    scenes: dict[str, list[float]] = {}
+    for row in moves:
+        value = math.inf if row[column] is None else row[column]
+        scenes.setdefault(row["scene"], []).append(value)
+    values = [value for scene in scenes.values() for value in scene]
+    found: dict[str, Any] = {}
+    for name, quantile in quantiles.items():
+        found[name] = (
+            _finite(float(np.quantile(values, quantile, method="lower"))) if values else None
+        )
+        if 0 < quantile < 1:
+            bounds = quantile_interval([*scenes.values()], quantile)
+            found[f"{name}_ci95"] = [_finite(bound) for bound in bounds] if values else None
+    return found
+
+
+def _finite(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else value
 
 
 def _group_noise(rows: Sequence[Row]) -> dict[tuple[str, float], list[Row]]:
@@ -199,13 +219,13 @@ def _group_noise(rows: Sequence[Row]) -> dict[tuple[str, float], list[Row]]:
 
 
 def _summarize_noise(kind: str, size: float, rows: Sequence[Row]) -> dict[str, Any]:
-    placed = sum(row["result"] == MoveResult.PLACED.value for row in rows)
+    counts = count_by_scene(rows, MoveResult.PLACED.value)
     return {
         "kind": kind,
         "size": size,
         "moves": len(rows),
-        "placed": placed,
-        "placed_ci95": wilson_interval(placed, len(rows)),
+        "placed": sum(placed for placed, _ in counts),
+        "placed_ci95": share_interval(counts),
         "results": _count_results(rows),
     }
 
@@ -217,8 +237,8 @@ def _summarize_sequences(rows: Sequence[Row]) -> dict[str, Any]:
         "solved": len(solved),
         "solved_share": len(solved) / len(rows),
         "solved_ci95": wilson_interval(len(solved), len(rows)),
-        "minutes_of_solved": _quantiles(solved, "minutes", {"median": 0.5, "p95": 0.95}),
-        "moves_of_solved": _quantiles(solved, "moves", {"median": 0.5, "p95": 0.95}),
+        "minutes_of_solved": _quantiles(solved, "minutes", _DURATION_QUANTILES),
+        "moves_of_solved": _quantiles(solved, "moves", _DURATION_QUANTILES),
         "ended": dict(Counter(row["ended"] for row in rows).most_common()),
         "not_planned": sum(row["not_planned"] for row in rows),
     }

@@ -11,13 +11,13 @@ from typing import Any
 from drake_clutter.files import atomic_write, write_text
 
 
-def write_table(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> None:
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]], columns: Mapping[str, Any]) -> None:
     """Write a table as CSV and, with the extra `data`, as Parquet beside it.
 
     Args:
         path: Path of the tables without suffix.
         rows: Values by column; None and NaN are missing values.
-        columns: The columns, in their order.
+        columns: The columns, in their order, with their types.
     """
     table = [{column: _missing_to_none(row[column]) for column in columns} for row in rows]
     text = io.StringIO()
@@ -30,9 +30,10 @@ def write_table(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence
         import pyarrow as pa
         from pyarrow import parquet
 
-        arrays = {column: pa.array([row[column] for row in table]) for column in columns}
+        types = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
+        schema = pa.schema([(name, types[kind]) for name, kind in columns.items()])
         with atomic_write(path.with_suffix(".parquet")) as temporary:
-            parquet.write_table(pa.table(arrays), temporary)
+            parquet.write_table(pa.Table.from_pylist(table, schema), temporary)
 
 
 def _missing_to_none(value: Any) -> Any:

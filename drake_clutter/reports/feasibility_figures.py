@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.feasibility.move_study import PLANNED
-from drake_clutter.feasibility.summary import share_interval
+from drake_clutter.feasibility.summary import count_by_scene, share_interval
 
 Row = Mapping[str, Any]
 """Row of a table: values by column."""
@@ -54,7 +54,7 @@ def plot_ranking(summary: Row) -> Figure:
 
 
 def plot_failures(moves: Rows, setups: Sequence[str]) -> Figure:
-    """Plot the share of the possible moves with each reason of failure."""
+    """Plot the share of the possible moves with each reason of failure, and its interval."""
     possible = [row for row in moves if row["possible"]]
     failed = Counter(row["result"] for row in possible if row["result"] != PLANNED)
     reasons = [reason for reason, _ in failed.most_common()]
@@ -65,26 +65,22 @@ def plot_failures(moves: Rows, setups: Sequence[str]) -> Figure:
     for k, setup in enumerate(setups):
         rows = [row for row in possible if row["setup"] == setup]
         counts = Counter(row["result"] for row in rows)
-        shares = [counts[reason] / max(1, len(rows)) for reason in reasons]
+        shares = np.array([counts[reason] / max(1, len(rows)) for reason in reasons])
+        bounds = [share_interval(count_by_scene(rows, reason)) or (0, 1) for reason in reasons]
+        low, high = np.array(bounds).T
         positions = np.arange(len(reasons)) + k * height
-        axes.barh(positions, shares, height, label=setup)
-        for y, share, reason in zip(positions, shares, reasons, strict=True):
-            axes.text(share, y, f" {counts[reason]}", va="center", fontsize=11)
+        error = np.clip([shares - low, high - shares], 0, None)
+        axes.barh(positions, shares, height, xerr=error, capsize=3, label=setup)
+        for y, end, reason in zip(positions, high, reasons, strict=True):
+            axes.text(end, y, f"  {counts[reason]}", va="center", fontsize=11)
     axes.set_yticks(np.arange(len(reasons)) + 0.4 - height / 2, reasons)
     axes.invert_yaxis()
-    axes.set(xlabel="share of the possible moves (labels: number of moves)")
+    axes.set(xlabel="share of the possible moves (bars: 95 % interval; labels: number of moves)")
     axes.set_xlim(0, None)
     axes.margins(x=0.15)
     if len(setups) > 1:
         axes.legend(fontsize=10)
     return figure
-
-
-def _count_by_scene(rows: Rows) -> list[tuple[int, int]]:
-    """Return the numbers of planned and of all moves of each scene."""
-    total = Counter(row["scene"] for row in rows)
-    planned = Counter(row["scene"] for row in rows if row["result"] == PLANNED)
-    return [(planned[scene], count) for scene, count in total.items()]
 
 
 def _share(rows: Rows) -> float:
@@ -106,7 +102,9 @@ def _plot_planned_fractions(
         statistics = []
         for group in groups:
             rows = [row for row in moves if row["setup"] == setup and group_key(row) == group]
-            statistics.append((_share(rows), *(share_interval(_count_by_scene(rows)) or (0, 1))))
+            statistics.append(
+                (_share(rows), *(share_interval(count_by_scene(rows, PLANNED)) or (0, 1)))
+            )
         fraction, low, high = np.array(statistics).T
         error = np.clip([fraction - low, high - fraction], 0, None)
         positions = np.arange(len(groups)) + k * width

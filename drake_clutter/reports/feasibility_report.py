@@ -135,12 +135,13 @@ def answer_sentences(summary: Row) -> list[str]:
     comparison = next(
         c for c in summary["comparisons"] if {c["first"], c["second"]} == {best["name"], second}
     )
-    difference = 100 * comparison["difference"] * (1 if comparison["first"] == best["name"] else -1)
-    bounds = [100 * value for value in comparison["difference_ci95"]]
-    decided = "" if bounds[0] <= 0 <= bounds[1] else "not "
+    sign = 100 if comparison["first"] == best["name"] else -100
+    low, high = sorted(sign * bound for bound in comparison["difference_ci95"])
+    decided = "" if low <= 0 <= high else "not "
     sentences.append(
-        f"{time + '; ' if time else ''}{second} is next, {difference:.1f} points behind: the data "
-        f"are {decided}compatible with no difference."
+        f"{time + '; ' if time else ''}{second} is next, {sign * comparison['difference']:.1f} "
+        f"points behind (95 % interval {low:.1f} to {high:.1f}): the data are {decided}compatible "
+        "with no difference."
     )
     return sentences
 

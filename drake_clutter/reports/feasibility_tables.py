@@ -26,9 +26,22 @@ def _format(value: float | None, digits: int, unit: str = "") -> str:
     return "-" if value is None else f"{value:.{digits}f}{unit}"
 
 
-def _with_interval(value: float | None, bounds: Sequence[float] | None, digits: int = 3) -> str:
-    interval = "" if bounds is None else f" ({bounds[0]:.{digits}f} to {bounds[1]:.{digits}f})"
-    return _format(value, digits) + interval
+def _with_interval(
+    value: float | None, bounds: Sequence[float | None] | None, digits: int = 3, unit: str = ""
+) -> str:
+    """Return a value with its interval; "-" stands for what the data do not tell."""
+    if value is None or bounds is None:
+        return _format(value, digits, unit)
+    low, high = (_format(bound, digits) for bound in bounds)
+    return f"{_format(value, digits)} ({low} to {high}){unit}"
+
+
+def _quantile(found: Row, name: str, digits: int, unit: str = "", scale: float = 1.0) -> str:
+    """Return a quantile of `summary.json` with its interval, if it has one."""
+    value = found[name]
+    bounds = found.get(f"{name}_ci95")
+    scaled = None if bounds is None else [None if b is None else scale * b for b in bounds]
+    return _with_interval(None if value is None else scale * value, scaled, digits, unit)
 
 
 def _counts(counts: Mapping[str, int]) -> str:
@@ -67,7 +80,7 @@ def _setup_row(setup: Row, cell: WorkCell, ranking: Sequence[str]) -> dict[str, 
         "planned of possible": f"{setup['planned']} of {setup['possible']}",
         "share (95 % interval)": _with_interval(setup["share"], setup["share_ci95"]),
         "legal, but impossible": _counts(setup["impossible"]) or "none",
-        "cycle time, median": _format(setup["cycle_s"]["median"], 2, " s"),
+        "cycle time, median": _quantile(setup["cycle_s"], "median", 2, " s"),
     }
 
 
@@ -103,12 +116,12 @@ def _margins_row(setup: Row) -> dict[str, str]:
     margins = setup["margins"]
 
     def low_and_median(name: str, digits: int, scale: float = 1.0) -> str:
-        values = (margins[name][key] for key in ("p05", "median"))
-        return ", ".join(_format(None if v is None else scale * v, digits) for v in values)
+        keys = ("p05", "median")
+        return ", ".join(_quantile(margins[name], key, digits, "", scale) for key in keys)
 
     def shares(name: str) -> str:
-        values = (margins[name][key] for key in ("median", "p95", "largest"))
-        return ", ".join(_format(None if v is None else 100 * v, 0, " %") for v in values)
+        keys = ("median", "p95", "largest")
+        return ", ".join(_quantile(margins[name], key, 0, " %", 100) for key in keys)
 
     return {
         "setup": setup["name"],
@@ -132,10 +145,10 @@ def sequences_table(summary: Row) -> str:
                 "share (95 % interval)": _with_interval(
                     searches["solved_share"], searches["solved_ci95"], 2
                 ),
-                "robot time of these, median": _format(
-                    searches["minutes_of_solved"]["median"], 2, " min"
+                "robot time of these, median": _quantile(
+                    searches["minutes_of_solved"], "median", 2, " min"
                 ),
-                "moves of these, median": _format(searches["moves_of_solved"]["median"], 0),
+                "moves of these, median": _quantile(searches["moves_of_solved"], "median", 0),
                 "moves without a plan": str(searches["not_planned"]),
                 "ends": _counts(searches["ended"]),
             }

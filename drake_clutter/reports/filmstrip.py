@@ -5,21 +5,15 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from pydrake.geometry import (
-    ClippingRange,
-    ColorRenderCamera,
-    MakeRenderEngineVtk,
-    RenderCameraCore,
-)
-from pydrake.math import RigidTransform
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.sensors import CameraInfo
 
+from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.work_cell import WorkCell
-from drake_clutter.reports.scene_images import RENDER_ENGINE, look_at_pose
+from drake_clutter.reports.scene_images import PICTURE_LIGHTING, look_at_pose
 from drake_clutter.scenes.interfaces import MotionSample
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.simulation.cell_plant import add_work_cell, set_joint_angles
+from drake_clutter.simulation.plant_rasterizer import PlantRasterizer
 from drake_clutter.simulation.scene_plant import add_scene_plant, rigid_transform
 
 _OVERSAMPLING = 2
@@ -28,7 +22,6 @@ _CAMERA_POSITION = (1.10, -1.90, 1.30)
 _CAMERA_TARGET = (-0.22, 0.0, 0.46)
 """Point that the camera looks at [m]."""
 _FOV_Y_DEG = 36.0
-_RENDERER = "filmstrip"
 _MIN_HEIGHT_CHANGE = 0.002
 """Smallest change of an object's height that counts as lifting or lowering [m]."""
 
@@ -102,15 +95,12 @@ def render_frames(
     plant = scene_plant.plant
     arm = add_work_cell(plant, scene_plant.scene_graph, cell, compliant=True, visuals=True)
     plant.Finalize()
-    scene_plant.scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RENDER_ENGINE))
     diagram = builder.Build()
     root_context = diagram.CreateDefaultContext()
     plant_context = plant.GetMyMutableContextFromRoot(root_context)
+    rasterizer = PlantRasterizer(scene_plant.scene_graph.model_inspector())
     num_pixels = _OVERSAMPLING * side
-    info = CameraInfo(num_pixels, num_pixels, np.radians(_FOV_Y_DEG))
-    camera = ColorRenderCamera(
-        RenderCameraCore(_RENDERER, info, ClippingRange(0.05, 20.0), RigidTransform()), False
-    )
+    camera = Camera.overhead(1.0, width=num_pixels, height=num_pixels, fov_y_deg=_FOV_Y_DEG)
     R = rotation_to_base_side(cell)
     X_TC = rigid_transform(
         look_at_pose(R @ np.array(_CAMERA_POSITION), R @ np.array(_CAMERA_TARGET))
@@ -121,7 +111,6 @@ def render_frames(
             plant.SetFreeBodyPose(plant_context, body, rigid_transform(frame.poses[name]))
         set_joint_angles(plant, plant_context, arm, frame.q)
         query = query_port.Eval(scene_plant.scene_graph.GetMyContextFromRoot(root_context))
-        world_frame = query.inspector().world_frame_id()
-        color = query.RenderColorImage(camera, world_frame, X_TC).data[:, :, :3]
+        color = rasterizer.render(camera, X_TC, query, PICTURE_LIGHTING).color
         image = Image.fromarray(color).resize((side, side), Image.Resampling.LANCZOS)
         yield np.asarray(image)

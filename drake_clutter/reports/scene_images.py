@@ -8,16 +8,16 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from pydrake.geometry import LightParameter, RenderEngineVtkParams
 from scipy.ndimage import find_objects
 
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.support import Support
 from drake_clutter.cell.work_cell import default_cell
+from drake_clutter.rendering.lighting import Lamp, LampKind, Lighting
 from drake_clutter.rendering.mesh_renderer import RenderedImages
+from drake_clutter.rendering.scene_rasterizer import SceneRasterizer
 from drake_clutter.reports.canvas import Canvas, Rectangle, TextLabel, innermost_point
 from drake_clutter.scenes.scene import Pose, Scene
-from drake_clutter.simulation.camera_renderer import CameraRenderer
 from drake_clutter.simulation.scene_plant import pose_from_transform
 
 OVERHEAD_SIZE = (720, 720)
@@ -37,34 +37,16 @@ _CAMERA_TARGET = (0.0, -0.02, 0.08)
 """Point that the oblique camera looks at [m]."""
 
 
-def _make_light(
-    kind: str, position: tuple[float, float, float], intensity: float, frame: str = "world"
-) -> LightParameter:
-    return LightParameter(
-        type=kind,
-        position=position,
-        direction=[-v for v in position] if any(position) else [0, 0, 1],
-        frame=frame,
-        intensity=intensity,
-        attenuation_values=[1, 0, 0],
-        cone_angle=16,
-    )
-
-
-# Only the spot light casts shadows. Point lights cannot, and shadows of directional lights would
-# also come from bodies that are parked out of sight.
-RENDER_ENGINE = RenderEngineVtkParams(
-    backend="EGL",
-    default_clear_color=[0.95, 0.955, 0.96],
-    lights=[
-        _make_light("spot", (-0.75, -0.85, 2.6), 2.0),
-        _make_light("point", (0.0, 0.0, 0.0), 0.7, "camera"),
-        _make_light("point", (1.2, -1.8, 1.2), 0.5),
-        _make_light("point", (-1.5, 1.2, 1.2), 0.4),
-    ],
-    cast_shadows=True,
-    shadow_map_size=2048,
+PICTURE_LIGHTING = Lighting(
+    (
+        Lamp(LampKind.DIRECTIONAL, (0.75, 0.85, -2.6), 2.2, casts_shadows=True),
+        Lamp(LampKind.DIRECTIONAL, (0.0, 0.0, 1.0), 0.7, is_on_camera=True),
+        Lamp(LampKind.DIRECTIONAL, (-1.2, 1.8, -1.2), 0.5),
+    ),
+    ambient=0.18,
+    background=(242, 244, 245),
 )
+"""Light of images for people: a main lamp with soft fill light from the camera and the front."""
 
 
 class Highlight(Enum):
@@ -215,12 +197,13 @@ class SceneRenderer:
         return _downsample(canvas.image)
 
     @cached_property
-    def _overhead(self) -> CameraRenderer:
-        return CameraRenderer(_camera_above(default_cell().support, OVERHEAD_SIZE), RENDER_ENGINE)
+    def _overhead(self) -> SceneRasterizer:
+        return SceneRasterizer(_camera_above(default_cell().support), PICTURE_LIGHTING)
 
     @cached_property
-    def _oblique(self) -> CameraRenderer:
-        return CameraRenderer(_camera_above(default_cell().support, OBLIQUE_SIZE), RENDER_ENGINE)
+    def _oblique(self) -> SceneRasterizer:
+        camera = _camera_above(default_cell().support, OBLIQUE_SIZE)
+        return SceneRasterizer(camera, PICTURE_LIGHTING)
 
     def _render_overhead_images(self, scene: Scene) -> RenderedImages:
         # The image after a move shows the same scene as the image before the next move.
