@@ -10,22 +10,25 @@ reaches it and there is no plan.
 import math
 import time
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 
 from benchmarks.measurement import describe_machine
 from benchmarks.pick_place import OutOption, write_results
 from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.config import ClutterConfig
+from drake_clutter.feasibility.arm_clearance import ObstacleTops
 from drake_clutter.feasibility.base_search import BaseGrid, find_reachable_moves
 from drake_clutter.feasibility.inverse_reachability import (
     InverseReachabilityMap,
+    MovePoses,
     build_inverse_reachability,
 )
 from drake_clutter.feasibility.move_study import find_legal_moves
@@ -40,6 +43,8 @@ from drake_clutter.seeding import item_rng
 from drake_clutter.validation import load_config_as
 from drake_clutter.workers.parallel_map import map_ordered
 from training.script import SCENES, SeedOption, WorkersOption, progress, run_script
+
+Floats = NDArray[np.float64]
 
 DATASET = "sg_star_20"
 """Dataset of the scenes; the first ones are taken."""
@@ -128,23 +133,79 @@ def draw_bases(cell: WorkCell, count: int, seed: int) -> list[BaseTest]:
     return tests
 
 
-def measure_query(cell: WorkCell, seed: int) -> tuple[float, float]:
-    """Return the time to build the maps [s], and that of a query [s]; processor times."""
+@dataclass(frozen=True, eq=False)
+class TimedMap(InverseReachabilityMap):
+    """Map that measures the processor time of its queries.
+
+    Attributes:
+        seconds: Time of each call [s].
+    """
+
+    seconds: list[float]
+
+    def find_reachable(
+        self, moves: MovePoses, bases: Floats, table_height: float, tops: ObstacleTops
+    ) -> NDArray[np.bool_]:
+        """Return which moves are reachable from each base; see `InverseReachabilityMap`."""
+        start = time.process_time()
+        found = super().find_reachable(moves, bases, table_height, tops)
+        self.seconds.append(time.process_time() - start)
+        return found
+
+
+@dataclass(frozen=True)
+class QueryTimes:
+    """Processor times of the maps.
+
+    Attributes:
+        build_s: Time to build the maps of all tools [s].
+        grasps_s: Mean time to sample the grasps of a move, once for all bases [s].
+        query_s: Median over the moves of the time for one base [s].
+        query_mean_s: Mean of it [s].
+        timed_moves: Number of moves.
+        timed_bases: Number of bases.
+    """
+
+    build_s: float
+    grasps_s: float
+    query_s: float
+    query_mean_s: float
+    timed_moves: int
+    timed_bases: int
+
+
+def measure_queries(cell: WorkCell, scenes: int, seed: int) -> QueryTimes:
+    """Return the processor times of the maps for the possible moves of the first scenes."""
     start = time.process_time()
-    maps = build_maps(cell)
-    built = time.process_time() - start
+    built = build_maps(cell)
+    build = time.process_time() - start
+    seconds = list[float]()
+    maps = {name: TimedMap(**vars(found), seconds=seconds) for name, found in built.items()}
     config = ClutterConfig(cell=cell)
     dataset = load_scene_dataset(SCENES / f"{DATASET}.json", load_catalog())
-    scene = dataset.settled_scene(0, dataset.grammar, config)
-    legal = find_legal_moves(scene, LabelDetector(cell.camera), config, seed, 0)
     low, high = np.array([*BASE_RANGES.values(), (0.0, 2 * math.pi)]).T
     bases = item_rng(seed, 1).uniform(low, high, (NUM_TIMED_BASES, 4))
     grid = BaseGrid(cell, (), bases)
-    find_reachable_moves(grid, maps, scene, legal)  # compiles
-    start = time.process_time()
-    found = find_reachable_moves(grid, maps, scene, legal)
-    queries = NUM_TIMED_BASES * sum(reach is not None for reach in found)
-    return built, (time.process_time() - start) / queries
+    per_base, others = list[float](), list[float]()
+    for index in range(scenes):
+        scene = dataset.settled_scene(index, dataset.grammar, config)
+        legal = find_legal_moves(scene, LabelDetector(cell.camera), config, seed, index)
+        find_reachable_moves(BaseGrid(cell, (), bases[:1]), maps, scene, legal)  # compiles
+        for move in legal:
+            seconds.clear()
+            start = time.process_time()
+            (found,) = find_reachable_moves(grid, maps, scene, [move])
+            if found is not None:
+                others.append(time.process_time() - start - sum(seconds))
+                per_base.append(sum(seconds) / NUM_TIMED_BASES)
+    return QueryTimes(
+        build,
+        float(np.mean(others)),
+        float(np.median(per_base)),
+        float(np.mean(per_base)),
+        len(per_base),
+        NUM_TIMED_BASES,
+    )
 
 
 def main(
@@ -158,7 +219,7 @@ def main(
     """Compare map and planner, and write the results."""
     path = resource_path(f"models/cells/{cell}.yaml")
     work_cell = load_cell(path)
-    built, query = measure_query(work_cell, seed)
+    times = measure_queries(work_cell, scenes, seed)
     tests = draw_bases(work_cell, bases, seed)
     make_tester = partial(BaseTester, path, scenes, seed)
     results = map_ordered(make_tester, tests, workers=workers)
@@ -180,8 +241,7 @@ def main(
         "right": right / total,
         "falsely_feasible": counts["reached, planned=False"] / total,
         "falsely_infeasible": counts["not reached, planned=True"] / total,
-        "build_s": built,
-        "query_s": query,
+        **asdict(times),
         "counts": dict(counts),
         "reasons": dict(
             sum((Counter(r.get("falsely_feasible", {})) for r in records), Counter[str]())

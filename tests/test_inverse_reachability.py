@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from conftest import DEFAULT_CELL, cell_with, resting, rng, scene_of
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform
 
 from drake_clutter.feasibility.arm_clearance import (
     ArmGeometry,
@@ -17,19 +16,20 @@ from drake_clutter.feasibility.arm_clearance import (
     collides_with_itself,
     collides_with_objects,
     place_capsules,
-    solve_downward,
 )
 from drake_clutter.feasibility.inverse_reachability import (
     SPACING,
     InverseReachabilityMap,
     MovePoses,
+    _dilate,
     find_move_poses,
     load_inverse_reachability,
     save_inverse_reachability,
 )
 from drake_clutter.files import InputError
+from drake_clutter.grammar.orientation import Orientation
 from drake_clutter.planning.collision_model import CollisionModel
-from drake_clutter.planning.pick_place_plan import PlanningFailure
+from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics, downward_pose
@@ -65,15 +65,21 @@ def disk_map(
 
 
 def move_rows(p_pick: Sequence[float], p_place: Sequence[float], top: float) -> MovePoses:
-    row = (*p_pick[:2], 0.3, *p_place[:2], 0.3, p_pick[2], p_place[2], top)
-    return MovePoses.join([np.array([row])], [0])
+    ends = [downward_pose(0.3, np.array(p)) for p in (p_pick, p_place)]
+    return MovePoses(
+        np.array([ends]), np.full((1, 2), 0.3), np.array([top]), np.array([0, 1]), np.array([0])
+    )
 
 
 def reaches(
-    found: InverseReachabilityMap, moves: MovePoses, bases: Sequence[Sequence[float]], table: float
+    found: InverseReachabilityMap,
+    moves: MovePoses,
+    bases: Sequence[Sequence[float]],
+    table: float,
+    tops: ObstacleTops = NO_TOPS,
 ) -> list[bool]:
     """Return whether the first move is reachable from each base."""
-    result: list[bool] = found.find_reachable(moves, np.array(bases), table, NO_TOPS)[:, 0].tolist()
+    result: list[bool] = found.find_reachable(moves, np.array(bases), table, tops)[:, 0].tolist()
     return result
 
 
@@ -113,20 +119,35 @@ def test_move_poses_follow_the_object() -> None:
     grasps = planner.grasps(can)
     assert not isinstance(grasps, PlanningFailure)
     place = Pose((0.2, 0.1, can.X_TO.p[2] + 0.05), can.X_TO.quaternion)
-    on_axis = DEFAULT_CELL.gripper.tools[grasps[0].tool]
-    tool = replace(on_axis, X_FG=RigidTransform([0.05, 0.0, 0.2]))
-    rows = find_move_poses(can, place, tool, [grasps[0]], planner.config)
-    assert rows.shape == (12, 9)
-    x, y, _, place_x, place_y, _, z, place_z, top = rows.T
-    assert place_x - x == pytest.approx(0.3 * np.ones(12))
-    assert place_y - y == pytest.approx(0.3 * np.ones(12))
-    assert place_z - z == pytest.approx(0.05 * np.ones(12))
-    assert top - place_z == pytest.approx(planner.config.lift_height * np.ones(12))
-    yaws = np.sort(rows[:, 2] % (2 * math.pi))
+    moves = find_move_poses(can, 0, place, [grasps[0]], planner.config)
+    picks, places = moves.ends.swapaxes(0, 1)
+    assert (places - picks)[:, :3, 3] == pytest.approx(np.tile([0.3, 0.3, 0.05], (12, 1)))
+    assert (places - picks)[:, :3, :3] == pytest.approx(np.zeros((12, 3, 3)))
+    assert moves.heights - places[:, 2, 3] == pytest.approx(
+        planner.config.lift_height * np.ones(12)
+    )
+    yaws = np.sort(moves.yaws[:, 0] % (2 * math.pi))
     assert np.diff(yaws) == pytest.approx(np.full(11, math.pi / 6))
-    near = [grasps[0], grasps[0]]
-    assert len(find_move_poses(can, place, tool, near, planner.config)) == 12, "the same place"
-    assert len(find_move_poses(can, place, on_axis, near, planner.config)) == 4
+    X = downward_pose(float(moves.yaws[3, 0]), picks[3, :3, 3])
+    assert picks[3] == pytest.approx(X)
+    joined = MovePoses.join([moves, replace(moves, picked=np.array([2]))])
+    assert (joined.starts.tolist(), joined.picked.tolist()) == ([0, 12, 24], [0, 2])
+
+
+def test_move_poses_on_a_side() -> None:
+    """The tool is horizontal; grasps that are close to each other count once, at four yaws."""
+    planner = PickPlacePlanner(DEFAULT_CELL, PlannerConfig())
+    box = resting("pudding_box")
+    grasps = planner.grasps(box, (-1.0, 0.0, 0.0))
+    assert not isinstance(grasps, PlanningFailure)
+    moves = find_move_poses(box, 0, box.X_TO, grasps, planner.config)
+    assert np.isnan(moves.yaws).all()
+    axes = moves.ends[:, 0, :3, 2]
+    assert axes == pytest.approx(np.tile([1.0, 0.0, 0.0], (len(axes), 1)), abs=1e-6)
+    positions = np.unique(moves.ends[:, 0, :3, 3].round(6), axis=0)
+    assert len(axes) == 4 * len(positions)
+    gaps = np.linalg.norm(positions[:, None] - positions[None], axis=2)
+    assert gaps[gaps > 0].min(initial=np.inf) >= 0.03
 
 
 class Arm:
@@ -151,24 +172,50 @@ class Arm:
         return placed
 
 
-def test_solutions_of_a_downward_tool() -> None:
-    arm = Arm("robot.base.yaw=25")
-    X_TB = arm.cell.robot.X_TB
-    base_yaw = math.radians(25)
-    for x, y, z, yaw in ((0.1, 0.2, 0.1, 0.4), (-0.3, 0.0, 0.3, -2.0), (2.0, 0.0, 0.1, 0.0)):
-        p_BG = X_TB.inverse() @ np.array([x, y, z])
-        pose = np.array([*p_BG, yaw - base_yaw])
-        expected = arm.tool.solve_ik(downward_pose(yaw, np.array([x, y, z])))
-        for branch in range(8):
-            q, X = np.empty(6), np.empty((2, 4, 4))
-            found = solve_downward(
-                *(arm.geometry.lengths, arm.geometry.X_0B, arm.geometry.X_G6),
-                *(pose, branch, X, q),
-            )
-            assert found == np.isfinite(expected[branch, 0])
-            if found:
-                # At a full turn, -pi and pi are the same.
-                assert np.cos(q - expected[branch]) == pytest.approx(np.ones(6), abs=1e-9)
+def full_map(arm: ArmGeometry) -> InverseReachabilityMap:
+    """Return a map by which every branch of an arm comes into question within 2 m."""
+    shape = 100, 200, 24
+    none = np.zeros((*shape, 8), np.float32)
+    every = np.full(shape, 255, np.uint8)
+    return InverseReachabilityMap(
+        np.arange(200) * np.float64(SPACING) - 2, every, none, none, np.zeros(2), arm
+    )
+
+
+def test_exact_poses_agree_with_the_planner() -> None:
+    """A tool that points down and one on a side reach a box where the planner does."""
+    arm = Arm()
+    q = rng(1).uniform(-math.pi, math.pi, (400, 6))
+    pairs = {(a, b) for a, b in arm.model.distances_along(q, 0.005).pairs.tolist()}
+    tool = arm.cell.gripper.tools[arm.name]
+    tools = full_map(ArmGeometry.from_model(arm.tool, tool, arm.model, pairs))
+    planner = PickPlacePlanner(arm.cell, PlannerConfig(optimize=False))
+    box = resting("pudding_box", Orientation.UPRIGHT_0, (0.15, 0.1))
+    scene = scene_of(box)
+    tops = ObstacleTops.from_scene(scene, arm.geometry.radii + planner.config.min_distance)
+    place = Pose((0.15, -0.05, float(box.X_TO.p[2])), box.X_TO.quaternion)
+    base = (*arm.cell.robot.base.translation, 0.0)
+    far = (-1.8, 0.0, 0.0, 0.0)
+    for normal in ((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)):
+        grasps = planner.grasps(box, normal)
+        assert not isinstance(grasps, PlanningFailure)
+        of_tool = [grasp for grasp in grasps if grasp.tool == arm.name]
+        assert isinstance(planner.plan([box], box.name, place, grasp=of_tool), PickPlacePlan)
+        moves = find_move_poses(box, 0, place, of_tool, planner.config)
+        table = arm.cell.table_height
+        assert reaches(tools, moves, [base, far], table, tops) == [True, False]
+        turned = [[*base[:3], 1.0]]
+        assert reaches(tools, moves, turned, table, tops) == [True], "the first joint turns back"
+        assert reaches(tools, moves, [base], 0.2, tops) == [False], "the grasp is below the table"
+
+
+def test_dilated_maps_have_the_bits_of_neighbors() -> None:
+    bits = np.zeros((4, 3, 24), np.uint8)
+    bits[0, 1, 0] = 4
+    dilated = _dilate(bits)
+    assert {tuple(index) for index in np.argwhere(dilated == 4).tolist()} == {
+        (i, j, k) for i in (0, 1) for j in (0, 1, 2) for k in (23, 0, 1)
+    }
 
 
 def test_capsules_are_where_the_collision_model_has_them() -> None:

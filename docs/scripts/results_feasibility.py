@@ -17,7 +17,8 @@ def page() -> str:
         "The possible moves of frozen scenes from random bases beside the tray, looked up in the "
         "map and planned. *Right*: map and planner agree. *Falsely feasible*: in reach by the map, "
         "and without a plan. Build and query: processor time on one core; a query is one move from "
-        "one base.",
+        "one base with all grasps, which are sampled once for all bases; the median over the "
+        "moves.",
         command=f"python {runs[0]['command']} --out FILE",
         seed=runs[0]["seed"],
         results=[f"benchmarks/results/{name}" for name in FILES],

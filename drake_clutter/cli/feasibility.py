@@ -128,7 +128,6 @@ def feasibility(
     Writes tables, `summary.json` and the web page `report.html`. An interrupted study resumes
     when the same command is given again.
     """
-    from drake_clutter.agents.explorers import make_policy_factory
     from drake_clutter.commands.feasibility_job import (
         FeasibilityJob,
         check_unique_names,
@@ -164,6 +163,8 @@ def feasibility(
     if searches:
         make_base_grids(next(iter(setups.values())).cell, searches)
     if agent is not None:
+        from drake_clutter.agents.explorers import make_policy_factory
+
         make_policy_factory(agent, config)
     elif simulate:
         raise InputError("--simulate: is for searches; expected --agent, too")

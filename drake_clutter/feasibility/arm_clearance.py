@@ -20,7 +20,6 @@ from drake_clutter.planning.collision_model import CollisionModel
 from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.robots.inverse_kinematics import UrInverseKinematics
 from drake_clutter.robots.serial_chain import chain_frames
-from drake_clutter.robots.ur_kinematics import solve_branch
 from drake_clutter.scenes.scene import Scene
 
 Floats = NDArray[np.float64]
@@ -195,45 +194,6 @@ def _raise_tops(outline, top, owner, radii, corner, first, owners, second):  # t
                     first[k, i, j], owners[k, i, j] = height, owner
                 elif height > second[k, i, j]:
                     second[k, i, j] = height
-
-
-@njit(cache=True, nogil=True)
-def solve_downward(lengths, X_0B, X_G6, pose, branch, X, q):  # type: ignore[no-untyped-def]
-    """Write the solution of a downward tool on a branch to q, and return whether there is one.
-
-    Args:
-        lengths: See `ArmGeometry`; as the two that follow.
-        X_0B: See `ArmGeometry`.
-        X_G6: See `ArmGeometry`.
-        pose: x, y, z [m] and yaw [rad] of the tool in B.
-        branch: Branch of the solution.
-        X: Two poses for intermediate results. Shape (2, 4, 4).
-        q: Receives the joint positions. Shape (6,).
-    """
-    c, s = np.cos(pose[3]), np.sin(pose[3])
-    for j in range(4):
-        last = X_G6[3, j]
-        X[0, 0, j] = c * X_G6[0, j] + s * X_G6[1, j] + pose[0] * last
-        X[0, 1, j] = s * X_G6[0, j] - c * X_G6[1, j] + pose[1] * last
-        X[0, 2, j] = -X_G6[2, j] + pose[2] * last
-        X[0, 3, j] = last
-    for i in range(4):
-        for j in range(4):
-            X[1, i, j] = 0.0
-            for k in range(4):
-                X[1, i, j] += X_0B[i, k] * X[0, k, j]
-    return solve_branch(
-        X[1],
-        branch,
-        0.0,
-        lengths[0],
-        lengths[1],
-        lengths[2],
-        lengths[3],
-        lengths[4],
-        lengths[5],
-        q,
-    )
 
 
 @njit(cache=True, nogil=True)

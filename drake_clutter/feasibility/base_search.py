@@ -15,16 +15,13 @@ from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.feasibility.arm_clearance import ObstacleTops
 from drake_clutter.feasibility.inverse_reachability import (
     InverseReachabilityMap,
-    MovePoses,
     find_move_poses,
 )
 from drake_clutter.feasibility.move_study import LegalMove
 from drake_clutter.feasibility.setups import Sweep
 from drake_clutter.files import input_error
-from drake_clutter.planning.pick_place_plan import PlanningFailure
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
-from drake_clutter.scenes.geometry import objects_resting_on
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.validation import load_config_as
 
@@ -133,27 +130,24 @@ def find_reachable_moves(
     found: list[NDArray[np.bool_] | None] = []
     for legal in moves:
         picked = scene[legal.move.pick]
-        grasps = planner.grasps(picked)
-        if (
-            legal.command is None
-            or isinstance(grasps, PlanningFailure)
-            or objects_resting_on(picked, scene.objects)
-        ):
+        if legal.command is None or not planner.can_pick(picked, scene.objects):
             found.append(None)
             continue
         is_reachable = np.zeros(len(grid.bases), bool)
-        for name, reachability in maps.items():
-            of_tool = [grasp for grasp in grasps if grasp.tool == name]
-            poses = find_move_poses(
-                picked, legal.command.X_TO_place, cell.gripper.tools[name], of_tool, config
-            )
-            reaches = reachability.find_reachable(
-                MovePoses.join([poses], [indices[picked.name]]),
-                grid.bases,
-                cell.table_height,
-                tops[name],
-            )
-            is_reachable |= reaches[:, 0]
+        for grasps in planner.graspable_faces(picked):
+            for name, reachability in maps.items():
+                # The sides are for bases that reach no grasp from above, as in planning.
+                pending = np.flatnonzero(~is_reachable)
+                of_tool = [grasp for grasp in grasps if grasp.tool == name]
+                if not len(pending) or not of_tool:
+                    continue
+                poses = find_move_poses(
+                    picked, indices[picked.name], legal.command.X_TO_place, of_tool, config
+                )
+                reaches = reachability.find_reachable(
+                    poses, grid.bases[pending], cell.table_height, tops[name]
+                )
+                is_reachable[pending] = reaches[:, 0]
         found.append(is_reachable)
     return found
 

@@ -4,7 +4,7 @@ Frames: T is the support, G is a tool of the gripper, O is the picked object.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -344,9 +344,17 @@ class PickPlacePlanner:
         """
         return self._grasp_finder.grasps(scene_object, normal)
 
+    def graspable_faces(self, scene_object: SceneObject) -> Iterator[Sequence[Grasp]]:
+        """Yield the grasps of each face that has any: from above first, then of the sides.
+
+        Args:
+            scene_object: The object at its pose.
+        """
+        return self._grasp_finder.graspable_faces(scene_object)
+
     def can_grasp(self, scene_object: SceneObject) -> bool:
         """Return whether the gripper has a grasp on an object that holds its weight."""
-        return any(True for _ in self._grasp_finder.graspable_faces(scene_object))
+        return any(True for _ in self.graspable_faces(scene_object))
 
     def can_pick(self, scene_object: SceneObject, objects: Sequence[SceneObject]) -> bool:
         """Return whether an object can be grasped and no other object rests on it.
@@ -386,7 +394,7 @@ class PickPlacePlanner:
             return False
         goal = MoveGoal(picked, X_TO_place, self.config.lift_height, True, self.robot.home)
         search = self._finder.search(model, self.home_state(objects), goal)
-        faces = self._grasp_finder.graspable_faces(picked)
+        faces = self.graspable_faces(picked)
         return any(search.has_candidate(grasp) for grasps in faces for grasp in grasps)
 
     def _step(self, name: str, trajectory: Trajectory, held: HeldObject | None) -> PlanStep:

@@ -3,6 +3,7 @@
 They are made without `pyplot`, whose import takes long.
 """
 
+import textwrap
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -202,7 +203,7 @@ def plot_by_position(
                     panel.text(
                         center_x, center_y, text, ha="center", va="center", color=color, fontsize=9
                     )
-        panel.set_title(setup, fontsize=11)
+        panel.set_title(textwrap.fill(setup, 40), fontsize=11)
         panel.set(xlabel="x in T [m]", ylabel="y [m]")
     figure.colorbar(image, ax=panels, label="planned share", shrink=0.8)
     return figure
@@ -244,7 +245,7 @@ def plot_reachability(maps: Mapping[str, Row], names: Sequence[str]) -> Figure:
             )
             if panel in axes[0]:
                 panel.set_title(_tilt_name(tilt), fontsize=11)
-        row[0].set_ylabel(f"{name}\ny [m]", fontsize=10)
+        row[0].set_ylabel(f"{textwrap.fill(name, 32)}\ny [m]", fontsize=10)
     for panel in axes[-1]:
         panel.set_xlabel("x in T [m]")
     figure.colorbar(image, ax=axes, label="reachable share of 12 directions", shrink=0.7)

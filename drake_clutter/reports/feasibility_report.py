@@ -51,7 +51,8 @@ _CSS = """body{font:16px/1.5 system-ui,"DejaVu Sans",sans-serif;max-width:1120px
 padding:0 1em;color:#1f2630}
 h1,h2{line-height:1.2}.scroll{overflow-x:auto}table{border-collapse:collapse;margin:1em 0}
 td,th{border:1px solid #cdd2d9;padding:.3em .6em;text-align:left;vertical-align:top}
-img{max-width:100%;margin:.5em 0}figure{margin:1em 0}
+img{max-width:100%;margin:.5em 0}figure{margin:1em 0;overflow-x:auto}
+@media (max-width:700px){figure img{max-width:none;width:900px}}
 .case{border-top:1px solid #cdd2d9;padding:.5em 0}.case img{max-height:300px;margin-right:1em}"""
 
 
