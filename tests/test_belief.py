@@ -193,6 +193,17 @@ def test_where_nothing_fits_nothing_is_left() -> None:
         assert (belief.nothing_left > 0.95) != is_left
 
 
+def test_what_carries_an_object_may_be_partly_in_sight() -> None:
+    """A box of 89 mm stands on two markers of 121 mm, of which it hides 74 %; one is known."""
+    known = [resting("large_marker", xy=(0.0, -0.010), name="known marker")]
+    known.append(resting("pudding_box", Orientation.UPRIGHT_0, floor=0.018, name="box"))
+    belief = believed(known, resting("large_marker", xy=(0.0, 0.010), name="hidden marker"))
+    (support,) = belief.supports
+    assert (support.carried, support.is_certain) == ("box", True)
+    assert "large_marker" in support.classes
+    assert belief.nothing_left < 0.05
+
+
 def test_points_of_no_known_object_are_something() -> None:
     belief = believed([resting("cracker_box")], resting("sugar_box", xy=(0.0, 0.25)))
     assert belief.supports == ()

@@ -102,12 +102,17 @@ def estimate_hidden(
     areas = {c.name: hidden_area(fits[c], columns) for c in classes}
     num_points = count_unidentified_points(known, observation, empty_depth)
     states = find_support_states(known, config.contact_doubt)
+    partly_seen = {}
+    if any(state is not SupportState.CARRIED for state in states.values()):
+        # What carries an object may be in sight, as long as the camera's threshold hides it.
+        unseen = 1 - observation.camera.visibility_threshold
+        partly_seen = {c: find_fits(c, columns, unseen) for c in classes}
     supports = tuple(
         HiddenSupport(
             o.name,
             states[o.name] is SupportState.UNCARRIED,
             _gap_below(o, known),
-            _supporting_classes(o, known, fits, Grid.over(observation.support)),
+            _supporting_classes(o, known, partly_seen, Grid.over(observation.support)),
         )
         for o in known
         if states[o.name] is not SupportState.CARRIED
@@ -157,7 +162,7 @@ def _supporting_classes(
     Args:
         carried: The object that is carried.
         known: Known objects.
-        fits: Where an object of each class would stand on the floor unseen.
+        fits: Where an object of each class would stand on the floor, hardly seen.
         grid: Grid of the cells.
     """
     lower, upper = carried.bounds_T

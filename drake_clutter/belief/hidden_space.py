@@ -126,34 +126,38 @@ def find_hidden_columns(known: Sequence[SceneObject], observation: Observation) 
 
 
 @njit(cache=True)
-def _fitting_cells(height, rows, required):  # type: ignore[no-untyped-def]
+def _fitting_cells(height, rows, required, unseen_fraction):  # type: ignore[no-untyped-def]
     """Return the cells at which an object fits in hidden columns.
 
     Args:
         height: See `HiddenColumns`. Shape (n, m).
         rows: Cells of the object's footprint, see `Footprint.rows`. Shape (r, 3).
         required: Height of the object [m].
+        unseen_fraction: Fraction of the footprint that must be in columns that are high enough.
 
     Returns:
         Whether the object fits with its center in each cell. Shape (n, m).
     """
     n, m = height.shape
+    total = 0
+    for k in range(len(rows)):
+        total += rows[k, 2] - rows[k, 1] + 1
+    allowed = int((1.0 - unseen_fraction) * total + 1e-9)
     fits = np.zeros((n, m), np.bool_)
     for i in range(n):
         for j in range(m):
-            is_free = height[i, j] >= required
+            missing = 0
             for k in range(len(rows)):
-                if not is_free:
-                    break
                 row, first, last = i + rows[k, 0], j + rows[k, 1], j + rows[k, 2]
                 if row < 0 or row >= n or first < 0 or last >= m:
-                    is_free = False
-                    break
+                    missing = total + 1
                 for column in range(first, last + 1):
-                    if height[row, column] < required:
-                        is_free = False
+                    if missing > allowed:
                         break
-            fits[i, j] = is_free
+                    missing += height[row, column] < required
+                if missing > allowed:
+                    break
+            fits[i, j] = missing <= allowed
     return fits
 
 
@@ -211,13 +215,23 @@ class HiddenFit(NamedTuple):
     cells: NDArray[np.bool_]
 
 
-def find_fits(object_class: ObjectClass, columns: HiddenColumns) -> list[HiddenFit]:
-    """Return where an object of a class may stand on the floor unseen, in each of its poses."""
+def find_fits(
+    object_class: ObjectClass, columns: HiddenColumns, unseen_fraction: float = 1.0
+) -> list[HiddenFit]:
+    """Return where an object of a class may stand on the floor unseen, in each of its poses.
+
+    Args:
+        object_class: The class.
+        columns: Unseen space.
+        unseen_fraction: Fraction of the object's outline that must be unseen.
+    """
     # The height of a column is off by up to half a step.
     return [
         HiddenFit(
             pose.height,
-            _fitting_cells(columns.height, pose.rows, pose.height - _HEIGHT_STEP / 2),
+            _fitting_cells(
+                columns.height, pose.rows, pose.height - _HEIGHT_STEP / 2, unseen_fraction
+            ),
         )
         for pose in standing_poses(object_class)
     ]
