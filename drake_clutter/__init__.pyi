@@ -67,6 +67,7 @@ from .tasks.episode import Backend as Backend, run_episode as run_episode
 from .tasks.exploration_task import ExplorationTask as ExplorationTask
 from .tasks.clutter_exploration import ClutterExploration as ClutterExploration
 from .tasks.oracle_search import OracleSearch as OracleSearch
+from .tasks.search_target import SearchTarget as SearchTarget, require_target as require_target
 from .agents.backend_factory import make_backend_factory as make_backend_factory
 from .agents.explorers import make_policy_factory as make_policy_factory
 

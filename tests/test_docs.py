@@ -103,6 +103,7 @@ PARSED = {
     "evaluate_detector",
     "evaluate_explorers",
     "evaluate_generators",
+    "evaluate_target_search",
     "exported_stability",
     "judge_agreement",
     "mujoco_motion",

@@ -28,6 +28,7 @@ import results_negative
 import results_perception
 import results_recording
 import results_rendering
+import results_target_search
 from markdown_text import estimate, number, table
 from results_files import with_current_keys
 
@@ -50,6 +51,7 @@ RESULTS = {
         results_perception,
         results_recording,
         results_rendering,
+        results_target_search,
     )
 }
 FILE = re.compile(r"`((?:training|benchmarks)/[\w./-]+)`")

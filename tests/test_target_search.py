@@ -8,8 +8,10 @@ import pytest
 import torch
 from conftest import CATALOG, CLASSES, DEFAULT_CELL, WORLD, random_scene, resting, rng, scene_of
 from gymnasium.utils.env_checker import check_env
+from typer.testing import CliRunner
 
 from drake_clutter.agents.area_reduction import uncovered_areas
+from drake_clutter.agents.behavior_cloning import BehaviorCloningConfig, BehaviorCloningLearner
 from drake_clutter.agents.episode_evaluation import EpisodeResult
 from drake_clutter.agents.explorer_network import ExplorerNetwork, collate_graphs, sample_actions
 from drake_clutter.agents.explorers import make_policy_factory
@@ -18,6 +20,8 @@ from drake_clutter.agents.learned_explorer import (
     explorer_metadata,
     load_explorer,
 )
+from drake_clutter.agents.ppo import PPOConfig, PPOLearner
+from drake_clutter.cli import app
 from drake_clutter.commands.explore_scene import episode_to_dict, explore_scene
 from drake_clutter.files import InputError
 from drake_clutter.grammar import Orientation
@@ -25,6 +29,7 @@ from drake_clutter.learning.checkpoint import load_checkpoint, save_checkpoint
 from drake_clutter.scenes.interfaces import Move, MoveResult, PickPlaceCommand
 from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.scenes.scene_dataset import SceneDataset, SceneRecord, load_scene_dataset
+from drake_clutter.scenes.scene_file import save_scene
 from drake_clutter.simulation.settle_executor import SettleExecutor
 from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.tasks.belief import Decision
@@ -232,6 +237,26 @@ def test_an_untrained_target_changes_nothing_and_a_trained_one_does(scenes: Scen
     assert not np.allclose(sample_actions(conditioned, batch, None).values, outputs[0].values)
 
 
+def test_students_learn_the_target(scenes: SceneDataset) -> None:
+    """Cloning labels the states by a teacher that sees the target; both learn its embedding."""
+    environment = ClutterExploration(scenes, target=RANDOM_HIDDEN, fidelity="static", max_moves=3)
+    device = torch.device("cpu")
+    teacher = ExplorerNetwork(len(environment.node_kind_ids), 8, finds_target=True)
+    cloning = BehaviorCloningConfig(
+        episodes_per_iteration=2, updates_per_iteration=1, batch_size=4, width=8
+    )
+    ppo = PPOConfig(episodes_per_iteration=2, update_epochs=1, width=8)
+    for learner in (
+        BehaviorCloningLearner(environment, teacher, cloning, 0, device),
+        PPOLearner(environment, ppo, 0, device),
+    ):
+        rollouts = learner.train_iteration()
+        sought = {int(o["target_kind"][0]) for r in rollouts for o in r.observations}
+        changed = learner.network.target_embedding.weight.abs().sum(dim=1) > 0
+        assert changed.any()
+        assert {k + 1 for k in np.flatnonzero(changed.numpy())} <= sought
+
+
 BESIDE = "-0.15,0.55,0.005,0"
 
 
@@ -351,3 +376,28 @@ def test_metrics_of_a_search() -> None:
     assert (solvable["revealed"], solvable["efficient"]) == (2 / 3, 1 / 3)
     assert (row["to_oracle"]["ratio"], row["to_oracle"]["episodes"]) == (8 / 6, 2)
     assert (row["to_area"]["ratio"], row["to_area"]["episodes"]) == (0.5, 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--retrieve"], "--retrieve: nothing to retrieve; expected --target"),
+        (
+            ["--retrieve", "--target", "cracker_box", "--set", "handover=null"],
+            "--retrieve: the cell has no handover; expected a pose in --cell, or as --set "
+            "handover.translation=[X,Y,Z]",
+        ),
+        (["--target", "cup"], "target: cup: is not in the scene; expected cracker_box, random-"),
+        (["--agent", "area-reduction"], "--agent area-reduction: looks for one object; expected a"),
+    ],
+)
+def test_misuse_of_explore_is_one_line(
+    options: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_scene(Path("scene.yaml"), scene_of(resting("cracker_box")), DEFAULT_CELL)
+    result = CliRunner().invoke(app, ["explore", "scene.yaml", *options, "--out", "out"])
+    assert isinstance(result.exception, InputError)
+    assert str(result.exception).startswith(message)
+    assert "\n" not in str(result.exception)
+    assert not Path("out/episode.json").exists()

@@ -28,6 +28,7 @@ import results_negative
 import results_perception
 import results_recording
 import results_rendering
+import results_target_search
 
 PAGES: Mapping[str, Callable[[], str]] = {
     "reference/api.md": api_page.page,
@@ -37,6 +38,7 @@ PAGES: Mapping[str, Callable[[], str]] = {
     "results/index.md": results_index.page,
     "results/generation.md": results_generation.page,
     "results/exploration.md": results_exploration.page,
+    "results/target_search.md": results_target_search.page,
     "results/closed_loop.md": results_closed_loop.page,
     "results/arm.md": results_arm.page,
     "results/perception.md": results_perception.page,

@@ -10,6 +10,7 @@ from results_generation import PAPER as PAPER_GENERATORS
 PAGES = (
     ("generation.md", "Scene generation", "Stability, hidden objects and diversity of generators"),
     ("exploration.md", "Exploration", "Success rates and moves of exploration policies"),
+    ("target_search.md", "Search for one object", "Moves until a hidden object is seen"),
     ("closed_loop.md", "Closed loop", "Success rates with images and the arm"),
     ("arm.md", "Arm", "Planning and execution of pick-and-place moves"),
     ("perception.md", "Perception", "Recall and accuracy of the trained detectors"),

@@ -4,26 +4,36 @@ from collections.abc import Mapping
 from typing import Any
 
 from markdown_text import estimate, number, section, table
-from results_files import policy_name, read_training_results
+from results_files import has_training_results, policy_name, read_training_results
 
+FILES = {
+    "target_search.json": ("Moves settled in Drake", "Drake settles every move."),
+    "target_search_static.json": (
+        "Moves by the static model",
+        "Moves have the fidelity `static_or_drake`: static equilibrium decides about stability, or "
+        "Drake where that is inconclusive.",
+    ),
+}
+"""Heading and fidelity of the measurements by results file; a file that is missing is left out."""
 PUBLISHED = (
     (
         "X-Ray (Danielczuk et al. 2020)",
         "0.82",
-        "heaps of 15 objects in a bin, overhead depth images; the target is also grasped",
+        "heaps of 15 objects in a bin, overhead depth image, poses not known; the target is "
+        "extracted",
     ),
     (
         "LAX-RAY (Huang et al. 2021)",
         "0.873",
-        "objects side by side on a shelf, seen from the front, pushed aside",
+        "upright objects on a shelf, seen from the front, pushed aside",
     ),
     (
         "StAX-RAY (Huang et al. 2022)",
         "0.82 to 1.00",
-        "stacks on a shelf, seen from the front, moved by blade and suction cup",
+        "stacks on a shelf, seen from the front, moved by a blade and a suction cup",
     ),
 )
-"""Method, success rate in simulation, and what differs, as their abstracts state them."""
+"""Method, success rate in simulation, and scenes, as the abstracts of the papers state them."""
 _HEAD = ["targets", "policy", "episodes", "revealed", "of the solvable", "collapsed", "moves"]
 _HEAD += ["moves / oracle", "within 1.25 of the oracle", "moves / area"]
 
@@ -45,38 +55,54 @@ def _row(row: Mapping[str, Any]) -> list[str]:
     ]
 
 
+def _rows(name: str) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = read_training_results(name)["rows"]
+    return sorted(rows, key=lambda row: str(row["set"]))
+
+
+def _measured(name: str) -> str:
+    """Return the section of a results file."""
+    title, fidelity = FILES[name]
+    results = read_training_results(name)
+    is_static = results["fidelity"] != "settle"
+    options = f" --fidelity {results['fidelity']} --out FILE" if is_static else ""
+    text = section(
+        title,
+        fidelity,
+        command=f"python training/evaluate_target_search.py runs/target_search{options}",
+        seed=results["seed"],
+        results=[f"training/results/{name}"],
+    )
+    return text + table(_HEAD, [_row(row) for row in _rows(name)]) + "\n"
+
+
 def page() -> str:
     """Return the page."""
-    results = read_training_results("target_search.json")
-    rows = sorted(results["rows"], key=lambda row: str(row["set"]))
-    text = "# Search for one object\n\n"
-    text += section(
-        "Frozen targets",
-        "A hidden object of each scene of a frozen dataset is looked for, at most 20 moves; Drake "
-        "settles every move. The policy is told the object's class. *Oracle*: the fewest moves "
-        "that reveal the object, from the true state. *Of the solvable*: pairs that the oracle "
-        "solves. *Moves*: mean over the revealed. *Moves / oracle*: over the revealed "
-        "solvable pairs. *Within 1.25 of the oracle*: fraction of the solvable pairs that are "
-        "revealed with at most 1.25 times the oracle's moves. *Moves / area*: ratio to the area "
-        "policy, over the pairs that both reveal. Intervals are 95 %.",
-        command="python training/evaluate_target_search.py",
-        seed=results["seed"],
-        results=["training/results/target_search.json"],
+    names = [name for name in FILES if has_training_results(name)]
+    text = (
+        "# Search for one object\n\n"
+        "In each scene of a frozen dataset, one hidden object is looked for, in at most 20 moves "
+        "([how to](../how_to/find_one_object.md)). The policy is told the object's class. "
+        "*Revealed*: fraction of the episodes in which the object is seen. *Of the solvable*: "
+        "fraction of those that the oracle search solves. *Moves*: mean over the episodes that "
+        "reveal the object. *Moves / oracle*: ratio to the fewest moves that reveal the object, "
+        "found from the true state, over the revealed solvable pairs. *Within 1.25 of the "
+        "oracle*: fraction of the solvable pairs that are revealed with at most 1.25 times those "
+        "moves. *Moves / area*: ratio to the area policy, over the pairs that both reveal. "
+        "Intervals are 95 %.\n\n"
+        "The oracle knows where the object is; the other policies do not, and half of the objects "
+        "need a single move of it.\n\n"
     )
-    text += table(_HEAD, [_row(row) for row in rows])
-    text += (
-        "\nThe oracle knows where the object is, the other policies do not: a search of stacks "
-        "that are equally promising needs more moves than a plan.\n\n"
-        "## Published searches\n\nSuccess rates in simulation, on tasks that differ.\n\n"
-    )
+    text += "".join(map(_measured, names))
     ours = [
         (
             f"{policy_name(row['agent'])}, {row['set']}",
             number(row["revealed"]),
-            "stacks on a tray, poses of visible objects known, moved by pick and place; the target "
-            "is revealed",
+            "stacks on a tray, overhead camera, poses of visible objects known, moved by pick and "
+            "place; the target is revealed",
         )
-        for row in rows
+        for row in _rows(names[0])
         if row["agent"] not in ("random", "full-knowledge")
     ]
+    text += "## Published searches\n\nSuccess rates in simulation, on tasks that differ.\n\n"
     return text + table(["method", "success", "scenes"], [*PUBLISHED, *ours])
