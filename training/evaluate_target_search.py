@@ -66,8 +66,8 @@ def collect_episodes(
     fidelity: str,
     seed: int,
     workers: int,
-) -> list[EpisodeResult]:
-    """Return the results of a policy's episodes; those that the record file lacks are run.
+) -> list[Row]:
+    """Return the records of a policy's episodes; those that the file lacks are run.
 
     Args:
         path: The record file.
@@ -94,8 +94,7 @@ def collect_episodes(
         EpisodeSpec(SCENES / targets.scenes, pair.scene, agent, k, pair.target)
         for k, pair in enumerate(targets.pairs[:count])
     ]
-    records = collect_records(path, header, runner, episodes, schema=EpisodeRecord, workers=workers)
-    return [EpisodeResult.from_record(record) for record in records]
+    return collect_records(path, header, runner, episodes, schema=EpisodeRecord, workers=workers)
 
 
 def is_revealed(result: EpisodeResult) -> bool:
@@ -229,11 +228,15 @@ def main(
         targets = load_target_set(TARGETS / f"{name}.json", scenes)
         num_episodes = min(count or len(targets.pairs), len(targets.pairs))
         asked = agents or SETS[name]
-        results = {
+        records = {
             agent: collect_episodes(
                 episodes_path(folder, name, agent), targets, agent, num_episodes, **options
             )
             for agent in dict.fromkeys((AREA_REDUCTION, *asked))
+        }
+        results = {
+            agent: [EpisodeResult.from_record(record) for record in records[agent]]
+            for agent in records
         }
         for agent in asked:
             row = {
@@ -242,6 +245,7 @@ def main(
                 "agent": agent,
                 "weights": checkpoint_sha256(agent, PRETRAINED_EXPLORERS),
                 **summarize(targets, results[agent], results[AREA_REDUCTION]),
+                "commits": list(dict.fromkeys(record["commit"] for record in records[agent])),
             }
             rows.append(row)
             if out is not None:
