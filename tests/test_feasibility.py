@@ -15,7 +15,7 @@ from conftest import DEFAULT_CELL, ONE_CUP, cell_with, resting, rng, scene_of
 from feasibility_jobs import feasibility_job
 from typer.testing import CliRunner
 
-from drake_clutter.cell.work_cell import WorkCell
+from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.cli import app
 from drake_clutter.commands import feasibility_job as command
 from drake_clutter.commands import feasibility_parts, feasibility_run
@@ -212,6 +212,15 @@ def test_unusable_setups_have_a_reason() -> None:
 
     assert reason("robot.base.x=-0.2") == "the base stands in the support"
     assert reason("robot.base.x=-5") == "no part of the support is in reach"
+    crate = '{"name": "crate", "box": [0.4, 0.4, 0.6], "pose": {"translation": [-0.65, 0, 0.6]}}'
+    clears_nothing = "no part of the support is in reach"
+    assert reason(f"fixtures=[{crate}]") == clears_nothing, "the arm is in a crate"
+    cell = load_cell(resource_path("models/cells/iiwa14_epick_tray.yaml"))
+    spec = cell.robot.model_copy(update={"ik": "ur"})
+    request = SetupRequest(cell.model_copy(update={"robot": spec}))
+    other = prepare_setup("it", request)
+    assert isinstance(other, UnusableSetup)
+    assert other.reason.startswith("robot.ik: 'ur' (iiwa14.sdf is no arm of the UR family")
 
 
 @pytest.mark.parametrize(

@@ -93,6 +93,22 @@ def load_config_from_options(
     return config
 
 
+def load_cell_from_options(
+    config_file: Path | None, cell_file: Path, settings: Sequence[str] | None
+) -> "WorkCell":
+    """Return the work cell of a file with fields replaced; its models are not loaded.
+
+    Args:
+        config_file: Configuration file, or None.
+        cell_file: Work cell file.
+        settings: Single fields, as FIELD=VALUE.
+    """
+    from drake_clutter.cell.work_cell import load_cell
+    from drake_clutter.config import ClutterConfig
+
+    return _override(ClutterConfig(cell=load_cell(cell_file)), config_file, settings).cell
+
+
 def load_scene_and_config(
     scene: Path,
     catalog: Path | None,

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from drake_clutter.cli.config_from_options import (
-    load_config_from_options,
+    load_cell_from_options,
     load_scene_and_config,
     reject_support_settings,
 )
@@ -146,7 +146,7 @@ def feasibility(
     check_unique_names("--cell, --cell-override", [*(cell_files or []), *(cell_override or [])])
     support = config.cell.support
     cells = {
-        path.stem: load_config_from_options(config_file, path, settings).cell.with_support(support)
+        path.stem: load_cell_from_options(config_file, path, settings).with_support(support)
         for path in cell_files or []
     }
     setups = make_setups(

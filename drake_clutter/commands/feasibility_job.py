@@ -14,7 +14,6 @@ from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.config import ClutterConfig, upgrade_cell
 from drake_clutter.feasibility.setups import SetupRequest, Sweep
 from drake_clutter.files import InputError, file_sha256
-from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.scene import Pose
 from drake_clutter.validation import (
     Finite,
@@ -147,7 +146,7 @@ def make_setups(
         default: Default cell. All cells get its support, on which the objects stand.
 
     Raises:
-        InputError: A file cannot be used, or a robot cannot be loaded.
+        InputError: A file cannot be used.
     """
     cells = {
         path.stem: SetupRequest(
@@ -173,9 +172,7 @@ def _load_setup_cell(path: Path, default: WorkCell) -> WorkCell:
     robot = document.get("robot") if isinstance(document, dict) else None
     if not isinstance(robot, dict) or "model" not in robot:
         return load_config_as(default, path, upgrade=upgrade_cell)
-    cell = load_cell(path)
-    load_robot(cell.robot)
-    return cell
+    return load_cell(path)
 
 
 def _with_base(cell: WorkCell, base: PoseSpec) -> SetupRequest:
