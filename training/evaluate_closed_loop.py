@@ -184,7 +184,7 @@ class EpisodeRunner:
             "arm_can": not self._reachability_bound(evaluation.cell).find_unrevealable(scene),
         }
         try:
-            task, known, robot_time = self._run(scene, scenario, evaluation)
+            task, known, robot_time = self.run(scene, scenario, evaluation)
         except Exception as error:  # Any exception is a result.
             record |= {"ended": EXCEPTION, "exception": repr(error)}
         else:
@@ -195,7 +195,7 @@ class EpisodeRunner:
             }
         return record | {"wall": time.perf_counter() - start}
 
-    def _run(
+    def run(
         self, scene: Scene, scenario: Scenario, evaluation: ClosedLoopEvaluation
     ) -> tuple[ExplorationTask, tuple[SceneObject, ...], float]:
         """Return the episode, the agent's list of objects, and the robot's time [s]."""

@@ -2,9 +2,10 @@
 
 from typing import Any
 
-from markdown_text import estimate, number, section, table
+from markdown_text import estimate, number, quantiles, section, table
 from results_files import (
     TRAINING,
+    has_benchmark_results,
     read_benchmark_results,
     read_episodes,
     read_training_results,
@@ -14,6 +15,8 @@ FAILURES = {
     "what is left lies behind what no cup holds": "remaining objects unreachable by suction"
 }
 """Current wording of reasons in results files of version 0.1."""
+SPEED = "closed_loop_speed.json"
+"""Results file of `benchmarks/closed_loop_speed.py`."""
 _SETUP = ["dataset", "perception", "motion", "cups", "episodes"]
 
 
@@ -100,6 +103,33 @@ def _wall_time() -> str:
     return text + table([*_SETUP, "robot time [min]", "wall time [s]"], [cells])
 
 
+def _speed() -> str:
+    results = read_benchmark_results(SPEED)
+    text = section(
+        "Wall time and its parts",
+        "Scenes of sg_star_25 from number 60 on, two cups, one process, nothing else on the "
+        "machine. The other columns are shares of the time of all episodes; *simulation* is "
+        "steps of the diagram and of motions that are simulated apart.",
+        command=f"python {results['command']} --out FILE",
+        seed="number of the scene",
+        results=[f"benchmarks/results/{SPEED}"],
+    )
+    parts = [*results["rows"][0]["shares"]]
+    return text + table(
+        ["perception", "episodes", "moves, median", "wall time, median / 95th [s]", *parts],
+        [
+            [
+                row["perception"],
+                str(row["episodes"]),
+                number(row["moves"]["p50"], 0),
+                quantiles(row["wall_s"], 1),
+                *(number(row["shares"][part]) for part in parts),
+            ]
+            for row in results["rows"]
+        ],
+    )
+
+
 def page() -> str:
     """Return the page."""
     intro = (
@@ -108,7 +138,10 @@ def page() -> str:
         "([closed loop](../explanation/closed_loop.md)). *labels*: perfect detections; *depth*, "
         "*depth-color*: the shipped detectors on noisy images.\n\n"
     )
-    return intro + _episodes() + "\n" + _wall_time()
+    sections = [_episodes(), _wall_time()]
+    if has_benchmark_results(SPEED):
+        sections.append(_speed())
+    return intro + "\n".join(sections)
 
 
 def closed_loop_episodes(name: str) -> dict[int, dict[str, Any]]:

@@ -255,6 +255,15 @@ class StationSimulation:
             )
             self.simulator.set_monitor(self.recorder.observe)
 
+    def expect_first_plan(self, affected: tuple[frozenset[str], ...]) -> None:
+        """Set the objects that the first plan affects, which are then not computed again.
+
+        Args:
+            affected: Names for each step, see `affected_bodies`.
+        """
+        self._affected_plan = 1
+        self._affected = affected
+
     def release(self) -> None:
         """Free the memory of the diagram; the simulation cannot be used afterwards.
 
@@ -612,8 +621,13 @@ def simulate_coarsely(
         plan: Plan that is to be executed.
         rate: Samples per second [Hz]; None records nothing.
     """
-    affected = frozenset[str]().union(*affected_bodies(scene.objects, plan))
-    return StationSimulation(cell, scene, movable=affected, time_step=COARSE_TIME_STEP, rate=rate)
+    affected = affected_bodies(scene.objects, plan)
+    movable = frozenset[str]().union(*affected)
+    simulation = StationSimulation(
+        cell, scene, movable=movable, time_step=COARSE_TIME_STEP, rate=rate
+    )
+    simulation.expect_first_plan(affected)
+    return simulation
 
 
 def simulate_plan(
