@@ -15,6 +15,7 @@ from results_files import (
     read_training_results,
 )
 from results_generation import spread
+from results_stopping import stopping
 
 MIN_PAIRS = 10
 """Fewest scenes that both of two policies solve for their numbers of moves to be compared."""
@@ -387,5 +388,5 @@ def page() -> str:
         [[name, f"`{agent}`" if agent else "", text] for name, agent, text in _NAMES],
     )
     parts = [_policies(), _pairs(), _static_and_drake(), _placement_rule(), _action_filter()]
-    parts.append(_seeds())
+    parts += [stopping(), _seeds()]
     return intro + "\n" + "\n".join([*parts, _trainings(), _environment()])
