@@ -153,6 +153,33 @@ def test_grasps_of_ones_own_have_to_hold() -> None:
         PLANNER.make_grasp(BOX, "hook", X_OT)
 
 
+def test_given_grasps_have_to_hold_the_object() -> None:
+    found = PLANNER.grasps(BOX)
+    assert not isinstance(found, PlanningFailure)
+    high = replace(found[0], X_TG=found[0].X_TG @ RigidTransform([0.0, 0.0, -0.1]))
+    move = SCENE.objects, BOX.name, PLACE
+    failure = failed(PLANNER.plan(*move, grasp=high))
+    assert failure.reason is PlanningFailureReason.NO_SEAL
+    assert failure.value == pytest.approx(0.1 + PlannerConfig().lip_gap)
+    plan = PLANNER.plan(*move, grasp=[high, found[0]])
+    assert isinstance(plan, PickPlacePlan)
+    assert plan.X_OG.translation()[2] < BOX.top_height
+    behind = RigidTransform(RotationMatrix(), [0.0, 0.0, 1.0])
+    reason = failed(PLANNER.make_grasp(BOX, "large", behind)).reason
+    assert reason is PlanningFailureReason.NO_SEAL, "the cup points away from the box"
+    for grasp, message in (([], "grasp: none"), (replace(high, tool="hook"), "tool: 'hook'")):
+        with pytest.raises(InputError, match=message):
+            PLANNER.plan(*move, grasp=grasp)
+    with pytest.raises(InputError, match="normal: "):
+        PLANNER.grasps(BOX, (0.0, 1.0))  # type: ignore[arg-type]
+
+
+def test_objects_have_names_of_their_own() -> None:
+    twins = [BOX, replace(BOX, X_TO=BOX.X_TO.translated((0.2, 0.0, 0.0)))]
+    with pytest.raises(InputError, match=f"objects: '{BOX.name}' twice; expected names that"):
+        PLANNER.plan(twins, BOX.name, PLACE)
+
+
 def test_a_jaw_grasp_of_ones_own_has_to_fit() -> None:
     cell = load_cell(resource_path("models/cells/ur10_2f85_tray.yaml"))
     planner = PickPlacePlanner(cell, PlannerConfig(optimize=False))

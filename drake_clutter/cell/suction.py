@@ -293,9 +293,10 @@ class SuctionGripper(StrictModel):
         cup = self.cup(tool)
         X_OG = X_TO.InvertAndCompose(X_TG)
         profile = lip_surface_profile(object_class, X_OG, cup.diameter) + sampling.lip_gap
-        if not self._seals(profile, cup.diameter):
+        is_inside = bool(profile.min() < -MAX_SEAL_GAP)
+        if is_inside or not self._seals(profile, cup.diameter):
             value = self._mismatch(profile, cup.diameter)[1]
-            return GraspFailure(GraspFailureReason.NO_SEAL, value)
+            return GraspFailure(GraspFailureReason.NO_SEAL, abs(value))
         p_GCm = X_TG.inverse() @ (X_TO @ object_class.center_of_mass)
         payload = self._payload(cup, object_class, p_GCm, X_TG)
         if payload.max_acceleration < sampling.min_payload_acceleration:

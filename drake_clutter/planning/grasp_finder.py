@@ -5,12 +5,20 @@ Frames: T is the support, G is a tool of the gripper, O is the object.
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 from pydrake.math import RigidTransform
 
-from drake_clutter.cell.gripper import UP, Grasp, GraspFailure, GraspSampling, Gripper
+from drake_clutter.cell.gripper import (
+    UP,
+    Grasp,
+    GraspFailure,
+    GraspSampling,
+    Gripper,
+    LazyGrasps,
+)
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.files import InputError, format_value
 from drake_clutter.planning.motion_plan import HeldObject
@@ -58,7 +66,7 @@ class GraspFinder:
         Raises:
             InputError: The normal is not a direction.
         """
-        length = float(np.linalg.norm(normal))
+        length = float(np.linalg.norm(normal)) if len(normal) == 3 else math.nan
         if not 0 < length < np.inf:
             raise InputError(f"normal: {format_value(list(normal))}; expected a direction")
         x, y, z = (np.array(normal) / length).tolist()
@@ -118,6 +126,37 @@ class GraspFinder:
                 return True
         return False
 
+    def verified(
+        self, picked: SceneObject, grasps: Sequence[Grasp]
+    ) -> Sequence[Grasp] | PlanningFailure:
+        """Return given grasps as the gripper holds the object with them.
+
+        Args:
+            picked: Object at its pose.
+            grasps: Grasps, at least one.
+
+        Returns:
+            Those that hold the object, which are found when they are used, or why the first one of
+            several does not if none does.
+
+        Raises:
+            InputError: There is no grasp, or the gripper has no such tool.
+        """
+        if not grasps:
+            raise InputError("grasp: none; expected at least one grasp")
+        failures = list[PlanningFailure]()
+
+        def check(grasp: Grasp) -> Iterator[Grasp]:
+            X_OG = rigid_transform(picked.X_TO).InvertAndCompose(grasp.X_TG)
+            found = self.make_grasp(picked, grasp.tool, X_OG)
+            if isinstance(found, PlanningFailure):
+                failures.append(found)
+            else:
+                yield replace(found, num_angles=grasp.num_angles)
+
+        found = LazyGrasps(verified for grasp in grasps for verified in check(grasp))
+        return found if next(iter(found), None) is not None else failures[0]
+
     def make_grasp(
         self, picked: SceneObject, tool: str, X_OG: RigidTransform
     ) -> Grasp | PlanningFailure:
@@ -127,7 +166,13 @@ class GraspFinder:
             picked: Object at its pose.
             tool: Name of the tool.
             X_OG: Pose of the tool in the object.
+
+        Raises:
+            InputError: The gripper has no such tool.
         """
+        if tool not in self._gripper.tools:
+            allowed = ", ".join(self._gripper.tools)
+            raise InputError(f"tool: {format_value(tool)}; expected one of {allowed}")
         if failure := self._check_payload(picked):
             return failure
         X_TO = rigid_transform(picked.X_TO)

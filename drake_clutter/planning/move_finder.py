@@ -26,6 +26,7 @@ from drake_clutter.planning.state_check import (
     JOINT_TOLERANCE,
     check_configuration,
     check_joint_limits,
+    check_names,
     to_configuration,
 )
 from drake_clutter.planning.tool_kinematics import ToolKinematics
@@ -79,8 +80,12 @@ class MoveFinder:
         Args:
             objects: Objects in the scene.
             occluded: Occluded volumes, which count as obstacles.
+
+        Raises:
+            InputError: Two objects have the same name.
         """
         named_classes = tuple((o.name, o.object_class) for o in objects)
+        check_names(objects)
         key = named_classes, tuple(occluded)
         if key not in self._collision_models:
             self._collision_models.clear()
@@ -118,7 +123,11 @@ class MoveFinder:
                 return self._grasp_finder.failure(goal.picked)
             candidates: Iterable[Sequence[Grasp]] = chain([first], faces)
         else:
-            candidates = [(grasp,) if isinstance(grasp, Grasp) else grasp]
+            given = (grasp,) if isinstance(grasp, Grasp) else grasp
+            verified = self._grasp_finder.verified(goal.picked, given)
+            if isinstance(verified, PlanningFailure):
+                return verified
+            candidates = [verified]
         model = self.collision_model(state.objects, occluded)
         failure = self._check_endpoints(state, goal, model)
         if failure is not None:

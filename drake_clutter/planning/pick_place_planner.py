@@ -325,8 +325,6 @@ class PickPlacePlanner:
         Raises:
             InputError: The gripper has no such tool.
         """
-        if tool not in self.tools:
-            raise InputError(f"tool: {format_value(tool)}; expected one of {', '.join(self.tools)}")
         return self._grasp_finder.make_grasp(picked, tool, X_OG)
 
     def grasps(

@@ -34,6 +34,18 @@ def find_object(objects: Sequence[SceneObject], name: str) -> SceneObject:
     raise InputError(f"pick: {format_value(name)} is not a known object; expected {names}")
 
 
+def check_names(objects: Sequence[SceneObject]) -> None:
+    """Check that objects have names of their own.
+
+    Raises:
+        InputError: Two objects have the same name.
+    """
+    names = [o.name for o in objects]
+    if len({*names}) < len(names):
+        twice = next(name for k, name in enumerate(names) if name in names[:k])
+        raise InputError(f"objects: {twice!r} twice; expected names that differ")
+
+
 def to_configuration(robot: RobotModel, q: Sequence[float], name: str) -> Floats:
     """Return joint positions as an array. Shape (n,).
 
