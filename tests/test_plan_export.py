@@ -174,6 +174,7 @@ def test_plans_to_poses_are_exported_from_the_command_line(tmp_path: Path) -> No
     assert refused["quantity"] == "37 mm"
     for extra, message in (
         (["--rate", "5"], "--rate 5 with --export csv; expected 10 to 1000 Hz"),
+        (["--rate", "nan"], "--rate nan; expected a finite number"),
         (["--export", "pdf"], "'pdf' is not one of 'csv', 'urscript'"),
     ):
         result = CliRunner().invoke(app, [*arguments, *extra, "--out", str(tmp_path / "no")])

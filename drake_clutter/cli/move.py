@@ -1,5 +1,6 @@
 """`drake-clutter move`."""
 
+import math
 from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any
@@ -103,6 +104,8 @@ def move(
         raise InputError(f"--rate {rate:g} without --export; expected --export csv or urscript")
     formats = [choice.value for choice in dict.fromkeys(export or [])]
     export_rate = DEFAULT_EXPORT_RATE if rate is None else rate
+    if not math.isfinite(export_rate):
+        raise InputError(f"--rate {export_rate:g}; expected a finite number")
     requested = read_moves(moves) if moves else [Move(str(pick), str(place))]
     file, config = load_scene_and_config(scene, catalog, config_file, cell_file, settings)
     pairs = [[move.pick, move.place] for move in requested]

@@ -345,7 +345,12 @@ class CollisionModel:
         return self._shape_names[shape]
 
     def distances_along(
-        self, path: Floats, max_distance: float, *, with_gradients: bool = False
+        self,
+        path: Floats,
+        max_distance: float,
+        *,
+        with_gradients: bool = False,
+        until_collision: bool = False,
     ) -> FoundDistances:
         """Return the signed distances below a threshold along a path.
 
@@ -353,9 +358,15 @@ class CollisionModel:
             path: Joint positions of the arm. Shape (m, n).
             max_distance: Threshold [m].
             with_gradients: Whether to compute gradients.
+            until_collision: Whether to leave out what follows the first intersection of the arm, so
+                that the depth of no other one is computed.
         """
         return self._find_distances(
-            path, max_distance, self._active_pairs, with_gradients=with_gradients
+            path,
+            max_distance,
+            self._active_pairs,
+            with_gradients=with_gradients,
+            until_collision=until_collision,
         )
 
     def is_between(self, found: FoundDistances, pair: tuple[str, str]) -> NDArray[np.bool_]:
@@ -420,7 +431,7 @@ class CollisionModel:
         others = [shape for shape in self._solid_shapes if shape not in shapes]
         pairs = np.array([(shape, other) for shape in shapes for other in others], np.int64)
         q = np.zeros((1, len(self._q_indices)))
-        found = self._find_distances(q, max_distance, pairs, with_gradients=False)
+        found = self._find_distances(q, max_distance, pairs)
         return [self.signed_distance(found, k) for k in range(len(found.rows))]
 
     @property
@@ -429,13 +440,23 @@ class CollisionModel:
         return self._pairs if self._attached is None else self._attached_pairs(self._attached.name)
 
     def _find_distances(
-        self, path: Floats, max_distance: float, pairs: NDArray[np.int64], *, with_gradients: bool
+        self,
+        path: Floats,
+        max_distance: float,
+        pairs: NDArray[np.int64],
+        *,
+        with_gradients: bool = False,
+        until_collision: bool = False,
     ) -> FoundDistances:
         found = self._shapes.find_distances(
             path, pairs, max_distance, with_gradients=with_gradients
         )
+        unknown = np.isnan(found.distances)
         is_kept = np.ones(len(found.rows), bool)
-        for k in np.flatnonzero(np.isnan(found.distances)):
+        if until_collision:
+            of_arm = np.flatnonzero(unknown & self._is_of_arm[found.pairs[:, 0]])
+            is_kept[int(of_arm[0]) + 1 if len(of_arm) else len(is_kept) :] = False
+        for k in np.flatnonzero(unknown & is_kept):
             # Depths of penetration and rare shapes are Drake's.
             pair = self._query_pair(path[found.rows[k]], found.pairs[k])
             found.distances[k] = pair.distance if pair else 0.0

@@ -119,6 +119,7 @@ class MotionLimits:
         widths = {LimitKind.LOAD: 1, LimitKind.TOOL_SPEED: len(tools)}
         counts = [widths.get(kind, n) for kind in LimitKind]
         self._kinds: NDArray[np.object_] = np.repeat([*LimitKind], counts)
+        self._time_orders = np.array([_TIME_ORDERS[kind] for kind in self._kinds])
 
     def ratios(self, motion: MotionSamples) -> "LimitRatios":
         """Return the ratios of a motion to its limits.
@@ -152,7 +153,7 @@ class MotionLimits:
             ratios = self._tilted_load.ratios(R_BF, moved.accelerations[:, 0])
             column = int(np.flatnonzero(self._kinds == LimitKind.LOAD)[0])
             values[:, column] = np.maximum(values[:, column], ratios)
-        return LimitRatios(values, self._kinds)
+        return LimitRatios(values, self._kinds, self._time_orders)
 
     def find_violation(self, ratios: "LimitRatios") -> LimitViolation | None:
         """Return the limit that is exceeded most by more than `LIMIT_TOLERANCE`, if any."""
@@ -223,10 +224,12 @@ class LimitRatios:
         values: Ratios. Shape (m, k).
         kinds: Kind of each column: `LimitKind` of each joint, of the load or of each tool. Shape
             (k,).
+        time_orders: Power of the time scale by which each column decreases. Shape (k,).
     """
 
     values: Floats
     kinds: NDArray[np.object_]
+    time_orders: NDArray[np.int64]
 
     def time_scales(self) -> Floats:
         """Return the time scale at each sample that brings all ratios to at most 1.
@@ -238,8 +241,7 @@ class LimitRatios:
             Shape (m,).
         """
         scales = np.empty(len(self.values))
-        orders = np.array([_TIME_ORDERS[kind] for kind in self.kinds])
-        _calc_time_scales(self.values, orders, scales)
+        _calc_time_scales(self.values, self.time_orders, scales)
         return scales
 
 

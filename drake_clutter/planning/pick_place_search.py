@@ -311,16 +311,18 @@ class PickPlaceSearch:
             return None
         self._checker.set_up_segment("approach", candidate)
         below = self._bodies_below(self._picked)
-        of_gripper = self._checker.distances_below_object(candidate, q, below)
+        found = self._checker.distances_at(candidate, q)
+        of_gripper = self._checker.distances_below_object(candidate, found, below)
         context = EndpointContext(
             candidate.tool, candidate.X_TG_pick[:2, 3], of_gripper, candidate.load_distance
         )
-        if self._checker.min_distance_along(q[None], context, 1, "at the grasp") is None:
+        if self._checker.min_distance_along(q[None], context, 1, "at the grasp", found) is None:
             if self._checker.is_tool_in_collision:
                 self._poses_in_collision.add(pose)
             return None
         self._checker.set_up_segment("carry", candidate)
-        of_object = self._checker.contact_distances(candidate, q)
+        found = self._checker.distances_at(candidate, q)
+        of_object = self._checker.contact_distances(candidate, found)
         return replace(context, allowed_distances=of_gripper | of_object)
 
     def _place_endpoint(self, candidate: GraspCandidate, q: Floats) -> EndpointContext | None:
@@ -330,16 +332,17 @@ class PickPlaceSearch:
         """
         self._checker.set_up_segment("carry", candidate)
         below = self._bodies_below(replace(self._picked, X_TO=self._X_TO_goal))
-        of_gripper = self._checker.distances_below_object(candidate, q, below)
+        found = self._checker.distances_at(candidate, q)
+        of_gripper = self._checker.distances_below_object(candidate, found, below)
         allowed = (
-            of_gripper | self._checker.contact_distances(candidate, q)
+            of_gripper | self._checker.contact_distances(candidate, found)
             if self._goal.releases
             else {}
         )
         context = EndpointContext(
             candidate.tool, candidate.X_TG_place[:2, 3], allowed, candidate.load_distance
         )
-        distance = self._checker.min_distance_along(q[None], context, 2, "at the place")
+        distance = self._checker.min_distance_along(q[None], context, 2, "at the place", found)
         return None if distance is None else context
 
     def _bodies_below(self, placed: SceneObject) -> frozenset[str]:

@@ -90,8 +90,27 @@ class SegmentChecker:
             for name, tool in cell.gripper.tools.items()
         }
 
+    def distances_at(self, candidate: GraspCandidate, q: Floats) -> FoundDistances:
+        """Return the distances at an endpoint, for `distances_below_object` and others.
+
+        Args:
+            candidate: Grasp.
+            q: Joint positions. Shape (n,).
+        """
+        reach = max(MAX_REPORTED_DISTANCE, self._contact_reach(candidate))
+        return self._collision_model.distances_along(q[None], reach)
+
+    def _contact_reach(self, candidate: GraspCandidate) -> float:
+        """Return the distance up to which neighbors of the attached object matter [m]."""
+        return self._config.min_distance + candidate.load_distance + OPTIMIZATION_MARGIN
+
     def min_distance_along(
-        self, path: Floats, endpoint: EndpointContext, progress: int, stage: str
+        self,
+        path: Floats,
+        endpoint: EndpointContext,
+        progress: int,
+        stage: str,
+        found: FoundDistances | None = None,
     ) -> SignedDistance | None:
         """Return the smallest distance along a path to obstacles that it may not touch.
 
@@ -100,13 +119,19 @@ class SegmentChecker:
             endpoint: Endpoint near which smaller distances are allowed.
             progress: Stage of planning, see `FailureLog.record`.
             stage: Name of the stage for the failure.
+            found: Distances along the path, if they are known.
 
         Returns:
             The distance, infinite if nothing is near, or None after recording a failure if a
             distance is too small.
         """
         model, min_distance = self._collision_model, self._config.min_distance
-        found = model.distances_along(path, MAX_REPORTED_DISTANCE)
+        if found is None:
+            found = model.distances_along(path, MAX_REPORTED_DISTANCE, until_collision=True)
+        else:
+            found = found.select(found.distances <= MAX_REPORTED_DISTANCE)
+        if not len(found.rows):
+            return SignedDistance(math.inf)
         required = self.required_distances(found, path, endpoint, min_distance)
         if too_close := np.flatnonzero(found.distances < required).tolist():
             pairs = [model.signed_distance(found, k) for k in too_close]
@@ -154,7 +179,7 @@ class SegmentChecker:
         return required
 
     def distances_below_object(
-        self, candidate: GraspCandidate, q: Floats, below: Set[str]
+        self, candidate: GraspCandidate, found: FoundDistances, below: Set[str]
     ) -> dict[tuple[str, str], float]:
         """Return the allowed distances between gripper and bodies below a thin object [m].
 
@@ -162,11 +187,11 @@ class SegmentChecker:
 
         Args:
             candidate: Grasp.
-            q: Joint positions at which the tool holds the object. Shape (n,).
+            found: Distances where the tool holds the object, see `distances_at`.
             below: Names of the bodies below the object.
         """
         links = self._cell.gripper.tools[candidate.tool].contact_links
-        distances = self._collision_model.distances_below(q, self._config.min_distance)
+        distances = self._signed_distances(found, self._config.min_distance)
         # A body may have several geometries: the smallest distance is the last and is kept.
         return {
             distance.pair: max(distance.distance - CONTACT_TOLERANCE, self._config.lip_gap / 2)
@@ -174,8 +199,13 @@ class SegmentChecker:
             if distance.pair[0] in links and distance.pair[1] in below
         }
 
+    def _signed_distances(self, found: FoundDistances, max_distance: float) -> list[SignedDistance]:
+        """Return those distances that are not above a threshold [m]."""
+        near = np.flatnonzero(found.distances <= max_distance).tolist()
+        return [self._collision_model.signed_distance(found, k) for k in near]
+
     def contact_distances(
-        self, candidate: GraspCandidate, q: Floats
+        self, candidate: GraspCandidate, found: FoundDistances
     ) -> dict[tuple[str, str], float]:
         """Return the allowed distances to neighbors of the attached object, by names [m].
 
@@ -184,11 +214,10 @@ class SegmentChecker:
 
         Args:
             candidate: Grasp.
-            q: Joint positions at an endpoint. Shape (n,).
+            found: Distances at an endpoint, see `distances_at`.
         """
         name = self._picked.name
-        reach = self._config.min_distance + candidate.load_distance + OPTIMIZATION_MARGIN
-        distances = self._collision_model.distances_below(q, reach)
+        distances = self._signed_distances(found, self._contact_reach(candidate))
         of_object = [distance for distance in distances if distance.pair[0] == name]
         # A neighbor may have several geometries: the smallest distance is the last and is kept.
         return {

@@ -322,6 +322,9 @@ class SegmentPlanner:
         is_rigid = self._cell.gripper.tools[candidate.tool].compliant_joint is None
         if is_rigid or candidate.is_sideways:
             return None
+        heights = np.arange(0.0, self._config.max_guarded_descent + 1e-9, _DESCENT_STEP)
+        if len(heights) == 1:
+            return None
         X_place = candidate.X_TG_place
         # A thin object may be lowered until the gripper is just above what is below.
         allowed = {
@@ -331,7 +334,6 @@ class SegmentPlanner:
         }
         context = replace(place, allowed_distances=allowed)
         path = [q_place]
-        heights = np.arange(0.0, self._config.max_guarded_descent + 1e-9, _DESCENT_STEP)
         self._checker.set_up_segment("retreat", candidate)
         self._collision_model.set_object_pose(
             self._picked.name, self._X_TO_place.translated((0.0, 0.0, -10.0))

@@ -304,14 +304,25 @@ def smooth_time_scaling(grid: Floats, speeds: Floats) -> Floats:
     Returns:
         Values of s. Shape (k,).
     """
-    times = np.concatenate([[0.0], np.cumsum(2 * np.diff(grid) / (speeds[1:] + speeds[:-1]))])
+    return np.asarray(_average(grid, speeds))
+
+
+@njit(cache=True, nogil=True)
+def _average(grid, speeds):  # type: ignore[no-untyped-def]
+    """Return the control points (k,) of `smooth_time_scaling`."""
+    times = np.zeros(len(grid))
+    for k in range(1, len(grid)):
+        times[k] = times[k - 1] + 2 * (grid[k] - grid[k - 1]) / (speeds[k] + speeds[k - 1])
     half_width = SMOOTHING_TIME / 2
     count = math.ceil((times[-1] + SMOOTHING_TIME) / SPLINE_PERIOD) + 2 * SPLINE_ORDER - 3
     centers = (np.arange(count) - (SPLINE_ORDER - 2)) * SPLINE_PERIOD - half_width
     upper, lower = np.empty(count), np.empty(count)
     _integrate(times, grid, speeds, centers + half_width, upper)
     _integrate(times, grid, speeds, centers - half_width, lower)
-    return np.asarray(np.clip((upper - lower) / SMOOTHING_TIME, grid[0], grid[-1]))
+    for k in range(count):
+        s = (upper[k] - lower[k]) / SMOOTHING_TIME
+        upper[k] = min(max(s, grid[0]), grid[-1])
+    return upper
 
 
 @njit(cache=True, nogil=True)
@@ -345,8 +356,25 @@ def _samples_at_knots(points: Floats) -> MotionSamples:
     Returns:
         Samples of length k - 2.
     """
-    v = (points[2:] - points[:-2]) / (2 * SPLINE_PERIOD)
-    a = np.diff(points, 2, axis=0) / SPLINE_PERIOD**2
-    jerk = np.abs(np.diff(a, axis=0)) / SPLINE_PERIOD
-    jerk = np.maximum(np.vstack([jerk[:1], jerk]), np.vstack([jerk, jerk[-1:]]))
-    return MotionSamples((points[:-2] + 4 * points[1:-1] + points[2:]) / 6, v, a, jerk)
+    shape = len(points) - 2, points.shape[1]
+    samples = MotionSamples(*(np.empty(shape) for _ in range(4)))
+    _sample_knots(points, samples.q, samples.v, samples.a, samples.jerk)
+    return samples
+
+
+@njit(cache=True, nogil=True)
+def _sample_knots(points, q, v, a, jerk):  # type: ignore[no-untyped-def]
+    """Write positions, velocities, accelerations and jerks of `_samples_at_knots` (k - 2, n)."""
+    m, n = q.shape
+    for k in range(m):
+        for j in range(n):
+            before, here, after = points[k, j], points[k + 1, j], points[k + 2, j]
+            q[k, j] = (before + 4 * here + after) / 6
+            v[k, j] = (after - before) / (2 * SPLINE_PERIOD)
+            a[k, j] = ((after - here) - (here - before)) / SPLINE_PERIOD**2
+    for j in range(n):
+        left = abs(a[1, j] - a[0, j]) / SPLINE_PERIOD
+        for k in range(m):
+            right = left if k == m - 1 else abs(a[k + 1, j] - a[k, j]) / SPLINE_PERIOD
+            jerk[k, j] = max(left, right)
+            left = right
