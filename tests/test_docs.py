@@ -47,7 +47,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md"))]
 LINKING = [*PAGES, ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md"]
 BLOCK = re.compile(
-    r"(?:^ *<!-- (not run|file): (.+) -->\n)?^( *)```(\w*|{.+})\n(.*?)^\3```$",
+    r"(?:^ *<!-- (not run|file): ([^\n]+) -->\n)?^( *)```(\w*|{[^\n]+})\n(.*?)^\3```$",
     re.MULTILINE | re.DOTALL,
 )
 LINK = re.compile(r"\]\(([^)\s]+)\)")
@@ -310,6 +310,23 @@ def run_drake_clutter(
     assert result.exit_code == 0, f"{command} {options}: {result.output} {result.exception}"
     if command == "generate" and "--catalog" not in options and "--config" not in options:
         generated[key] = out.resolve()
+
+
+def test_blocks_end_at_their_fences() -> None:
+    """A comment and a title belong to one block, however many blocks follow."""
+    text = (
+        "<!-- file: a.yaml -->\n```yaml\na: 1\n```\n\n```sh\nb\n```\n\n"
+        '<!-- not run: reason -->\n```sh\nc\n```\n\n```{ .python title="d" }\nd\n```\n\n'
+        '```{ .python title="e" }\ne\n```\n'
+    )
+    found = [(match[1], match[2], match[5]) for match in BLOCK.finditer(text)]
+    assert found == [
+        ("file", "a.yaml", "a: 1\n"),
+        (None, None, "b\n"),
+        ("not run", "reason", "c\n"),
+        (None, None, "d\n"),
+        (None, None, "e\n"),
+    ]
 
 
 @each_page

@@ -109,18 +109,22 @@ def test_the_tests_of_the_line_come_first_and_the_fastest_of_them_first(tmp_path
     }
     lines = {name: [first] for name in outcomes} | {"beside": [first - 1], "": [1, 2]}
     (tmp_path / "test_module.json").write_text(
-        json.dumps({"outcomes": outcomes, "lines": {"module.py": lines}})
+        json.dumps({"outcomes": outcomes, "lines": {"module.py": lines}, "blobs": {}})
     )
     covered = TestCoverage.read(tmp_path)
     assert covered.tests(mutant, None) == (["fast", "slow", "beside"], 2)
     assert covered.tests(mutant, "slow") == (["slow", "fast", "beside"], 2)
     (tmp_path / "imports.json").write_text(
-        json.dumps({"outcomes": {}, "lines": {"module.py": {"": [first]}}})
+        json.dumps({"outcomes": {}, "lines": {"module.py": {"": [first]}}, "blobs": {}})
     )
     covered = TestCoverage.read(tmp_path)
     assert covered.tests(mutant, None) == (["beside", "fast", "slow"], 3)
     assert covered.runs_at_import(mutant)
     assert not covered.runs_at_import(find_mutants("module.py", SOURCE)[0])
+    (tmp_path / "test_gone.json").write_text(
+        json.dumps({"outcomes": {"gone": ("passed", 0.1)}, "lines": {}, "blobs": {"gone.py": "0"}})
+    )
+    assert "gone" not in TestCoverage.read(tmp_path).seconds
 
 
 def test_a_mutant_is_caught_by_the_first_test_that_fails() -> None:
