@@ -158,6 +158,7 @@ TESTS_OF_COMPILED_CODE = (
     "convex_distance",
     "motion_limits",
     "time_parameterization",
+    "load_check",
     "planner_robots",
     "pick_place_planner",
 )
