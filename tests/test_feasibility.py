@@ -56,6 +56,7 @@ from drake_clutter.planning.tool_kinematics import downward_pose
 from drake_clutter.reports import feasibility_cases, feasibility_figures
 from drake_clutter.reports.feasibility_maps import write_interactive_maps
 from drake_clutter.reports.feasibility_report import answer_sentences
+from drake_clutter.reports.feasibility_tables import _with_interval
 from drake_clutter.resources import resource_path
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.robots.ur_kinematics import jacobian, manipulability
@@ -692,3 +693,9 @@ def test_a_cell_override_from_a_file(tmp_path: Path) -> None:
             "gripper.extension=0.15",
         ]
     )
+
+
+def test_bounds_that_are_not_known_are_left_out() -> None:
+    assert _with_interval(1.25, [None, None], 1, " s") == "1.2 s"
+    assert _with_interval(1.25, [1.0, None], 1, " s") == "1.2 (1.0 to -) s"
+    assert _with_interval(None, None) == "-"

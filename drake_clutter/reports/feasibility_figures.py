@@ -47,7 +47,8 @@ def plot_ranking(summary: Row) -> Figure:
         cycle = setup["cycle_s"]["median"]
         text = f"{setup['planned']} of {setup['possible']}"
         text += "" if cycle is None else f", {cycle:.1f} s"
-        axes.text(0.01, float(y), text, va="center", fontsize=11)
+        box = {"color": "white", "alpha": 0.85, "pad": 1.5}
+        axes.text(0.012, float(y), text, va="center", fontsize=10, bbox=box)
     axes.set_yticks(positions, [setup["name"] for setup in setups])
     axes.invert_yaxis()
     axes.set(xlabel=f"{_SHARE_LABEL} (bars: 95 % interval)", xlim=(0, 1.02))

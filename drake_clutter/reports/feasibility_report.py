@@ -43,6 +43,8 @@ from drake_clutter.scenes.scene import Scene
 
 MAX_PANELS = 10
 """Number of setups, the best of the ranking, that are shown one by one."""
+MAX_COMPARISONS = 15
+"""Number of pairs of setups up to which their table is open."""
 MAX_LEGEND = 6
 """Number of setups, the best of the ranking, that share the axes of a figure."""
 MAX_SETUPS_WITH_CASES = 4
@@ -168,7 +170,10 @@ def _summary_parts(results: StudyResults) -> Iterable[str]:
         yield f"<p>Excluded, because they are unstable: {excluded}.</p>"
     if summary["comparisons"]:
         yield "<h2>Differences between setups</h2>"
-        yield comparisons_table(summary["comparisons"])
+        table = comparisons_table(summary["comparisons"])
+        count = len(summary["comparisons"])
+        is_long = count > MAX_COMPARISONS
+        yield f"<details><summary>{count} pairs</summary>{table}</details>" if is_long else table
     yield "<h2>Margins of the planned moves</h2>"
     yield margins_table(summary)
     if results.sequences:

@@ -30,7 +30,7 @@ def _with_interval(
     value: float | None, bounds: Sequence[float | None] | None, digits: int = 3, unit: str = ""
 ) -> str:
     """Return a value with its interval; "-" stands for what the data do not tell."""
-    if value is None or bounds is None:
+    if value is None or bounds is None or all(bound is None for bound in bounds):
         return _format(value, digits, unit)
     low, high = (_format(bound, digits) for bound in bounds)
     return f"{_format(value, digits)} ({low} to {high}){unit}"
