@@ -29,8 +29,9 @@ def _score(name: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
 def _scores(rows: Sequence[Mapping[str, Any]], sample: int, seed: int) -> str:
     text = section(
         "Scores",
-        f"{len(rows)} of a uniform sample of {sample} mutants of the modules that decide results. "
-        "*Caught*: a test fails, or the process ends. *Timed out*: two runs exceed a limit of "
+        f"{len(rows)} of a uniform sample of {sample} mutants of the modules that decide results"
+        + (". " if len(rows) == sample else "; the others, in changed lines, were not tested. ")
+        + "*Caught*: a test fails, or the process ends. *Timed out*: two runs exceed a limit of "
         "processor time, as of a loop without an end. *Equivalent*: the mutant gives the same "
         "results as the original. The last two columns count mutants that are caught or time out. "
         "The results file names the content of the module, as a Git blob, at which each mutant "
