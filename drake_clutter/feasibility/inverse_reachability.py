@@ -53,8 +53,6 @@ NUM_YAWS = 24
 """Number of yaws of the tool relative to the radial direction."""
 NUM_SIDE_YAWS = 4
 """Number of yaws of a tool about its axis on a side of an object."""
-SIDE_GRASP_DISTANCE = 0.03
-"""Of grasps on a side that are closer to each other, the first stands for the others [m]."""
 _FAR_AWAY = 50.0
 """Distance of the base from the support while the map is built [m]: nothing but itself is near."""
 _MAX_SOLUTIONS = 8
@@ -166,18 +164,14 @@ def find_move_poses(
         @ rigid_transform(picked.X_TO).inverse().GetAsMatrix4()
     )
     ends, yaws, heights = list[list[Floats]](), list[list[float]](), list[float]()
-    on_sides = list[Floats]()
     for grasp in grasps:
         X_pick = retreat_along_axis(grasp.X_TG.GetAsMatrix4(), config.lip_gap)
         X_place = X_moved @ X_pick
         points_down = is_vertical(X_pick) and is_vertical(X_place)
         number = grasp.num_angles or config.num_yaws
         if not points_down:
-            p_TG = X_pick[:3, 3]
-            is_near = any(np.linalg.norm(p_TG - p) < SIDE_GRASP_DISTANCE for p in on_sides)
-            if is_near or not is_sideways(X_pick):
+            if not is_sideways(X_pick):
                 continue
-            on_sides.append(p_TG)
             number = NUM_SIDE_YAWS
         for turn in np.arange(number) * (2 * math.pi / number):
             poses = [turn_about_axis(X, turn) for X in (X_pick, X_place)]
