@@ -16,6 +16,9 @@ collision model in common:
 - `KTO`: `KinematicTrajectoryOptimization` of Drake for minimum time with SNOPT, from the straight
   line in joint space; our distances and gradients are constraints at samples.
 
+`vamp-planner` (0.6.4) is left out: it has no model of the UR10, and its sources fetch what they
+need while they are built.
+
 Every trajectory is checked for collisions as densely as ours, and for limits at 500 Hz. Times are
 CPU times of the process; callbacks of the peers are Python. An interrupted run is resumed by the
 same command.

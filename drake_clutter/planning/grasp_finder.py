@@ -56,16 +56,7 @@ class GraspFinder:
     def grasps(
         self, scene_object: SceneObject, normal: Vector = UP
     ) -> Sequence[Grasp] | PlanningFailure:
-        """Return the feasible grasps of an object, closest to its center of mass first.
-
-        Args:
-            scene_object: The object at its pose.
-            normal: Direction from which it is grasped: surfaces whose outward normal differs by at
-                most 45 deg count. In T; a horizontal one for a side. Shape (3,).
-
-        Raises:
-            InputError: The normal is not a direction.
-        """
+        """Return the feasible grasps of a face, see `PickPlacePlanner.grasps`."""
         length = float(np.linalg.norm(normal)) if len(normal) == 3 else math.nan
         if not 0 < length < np.inf:
             raise InputError(f"normal: {format_value(list(normal))}; expected a direction")
