@@ -105,6 +105,7 @@ PARSED = {
     "evaluate_generators",
     "evaluate_target_search",
     "exported_stability",
+    "inverse_reachability",
     "judge_agreement",
     "mujoco_motion",
     "mutation_testing",
