@@ -69,7 +69,7 @@ ADDED = {
     "explore": ["--max-moves", "1"],
     "record": ["--max-moves", "1", "--resolution", "64x48"],
     "run": ["--set", "max_moves=1"],
-    "render_image_dataset": [],
+    "render_image_dataset": ["--renderer=raster", "--compact"],
     "train_detector": [
         "--set=learning.steps=1",
         "--set=learning.batch=2",

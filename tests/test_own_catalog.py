@@ -62,10 +62,12 @@ def test_a_scene_dataset_of_own_objects(with_poses: bool, folder: Path, tmp_path
     assert dataset.scenes[0].num_hidden > 0
 
 
-def test_images_of_own_objects(folder: Path, tmp_path: Path) -> None:
-    training_script("render_image_dataset").main(
-        tmp_path / "images", count=1, heap_fraction=0.0, objects="mine", catalog=folder
-    )
+def test_images_of_own_objects(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    script = training_script("render_image_dataset")
+    monkeypatch.setattr(script, "DISMANTLINGS", 1)
+    script.main(tmp_path / "images", count=1, heap_fraction=0.0, objects="mine", catalog=folder)
     images = ImageDataset(tmp_path / "images")
     assert {name for image in map(images.__getitem__, range(4)) for name in image.classes} <= {
         "flat",

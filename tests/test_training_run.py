@@ -78,7 +78,7 @@ class Counter:
         self.step = int(path.read_text())
 
 
-def train(out: Path, config: CountingConfig) -> list[int]:
+def train(out: Path, config: CountingConfig, max_minutes: float | None = None) -> list[int]:
     """Train to the end and return the evaluated steps; the evaluation at step 3 is the best."""
     learner = Counter()
     run = TrainingRun(out, config, learner, config.steps, steps_field="steps")
@@ -91,8 +91,20 @@ def train(out: Path, config: CountingConfig) -> list[int]:
         evaluate=lambda: ({"error": float(learner.step - 3)}, {}),
         evaluate_every=1,
         save_every=2,
+        max_minutes=max_minutes,
     )
     return [row["step"] for row in run.history]
+
+
+def test_a_training_interrupts_itself_and_is_resumed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert train(out, CountingConfig(), max_minutes=0.0) == []
+    assert "interrupted after 0 of 4 steps" in capsys.readouterr().out
+    assert not (out / "net.safetensors").exists()
+    assert train(out, CountingConfig(), max_minutes=60.0) == [1, 2, 3, 4]
+    assert weight_and_step(out / "net.safetensors") == (4.0, 4)
 
 
 def weight_and_step(path: Path) -> tuple[float, int]:

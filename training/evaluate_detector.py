@@ -3,11 +3,12 @@ r"""Evaluate a trained detector on shipped scene datasets and on rendered images
     python training/evaluate_detector.py --scenes training/scenes/sg_star_25.json \
         --detector training/checkpoints/detector_depth.safetensors --out detector.json
 
-The noise of a stereo camera is added to the depth images.
+The noise of a stereo camera is added to the depth images. With --textures unseen, the objects of
+each scene have random prints of kinds that no training image shows.
 """
 
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,13 +23,18 @@ from scipy.optimize import linear_sum_assignment
 
 from drake_clutter.catalog import Catalog, load_catalog
 from drake_clutter.config import ClutterConfig
-from drake_clutter.files import write_json
+from drake_clutter.files import InputError, write_json
 from drake_clutter.learning.checkpoint import load_checkpoint
+from drake_clutter.perception.calibration import (
+    ClassifiedDetection,
+    expected_calibration_error,
+    reliability_bins,
+)
 from drake_clutter.perception.depth_noise import add_depth_noise
 from drake_clutter.perception.image_dataset import ImageDataset, LabeledImage
 from drake_clutter.perception.learned_detector import LearnedDetector
 from drake_clutter.perception.pose_fit import pose_error
-from drake_clutter.perception.segmentation import SegmentationNetwork
+from drake_clutter.perception.segmentation import HAS_FAST_BFLOAT16, SegmentationNetwork
 from drake_clutter.rendering.scene_rasterizer import SceneRasterizer
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
@@ -37,11 +43,14 @@ from drake_clutter.simulation.camera_renderer import CameraRenderer
 from drake_clutter.simulation.image_renderer import ImageRenderer, RendererKind
 from drake_clutter.statistics import wilson_interval
 from drake_clutter.validation import to_plain
+from training.image_randomization import TextureSet, TextureVariation
 from training.results_file import provenance
 from training.script import CatalogOption, SeedOption, progress, run_script
 
 VISIBILITY_BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.01)
 """Bounds of the visible fractions for which recall is given separately."""
+MAX_CONFUSIONS = 10
+"""Largest number of pairs of confused classes in a results file."""
 MIN_IOU = 0.5
 """Smallest intersection over union of the masks of a detection and of its object."""
 
@@ -71,12 +80,12 @@ class DetectionMetrics:
 
     Attributes:
         objects: The objects of the images that are in view.
-        num_false_positives: Number of detections that are matched to no object.
+        detections: The detections with their true classes.
         seconds: Computing time of the detector for each image [s].
     """
 
     objects: Sequence[ObjectDetection]
-    num_false_positives: int
+    detections: Sequence[ClassifiedDetection]
     seconds: Sequence[float]
 
     def to_dict(self) -> dict[str, Any]:
@@ -91,14 +100,24 @@ class DetectionMetrics:
             by_visibility[name].append(o)
         translation_errors = [o.translation_error for o in recognized]
         rotation_errors = [o.rotation_error for o in recognized]
-        num_detections = len(found) + self.num_false_positives
+        confusions = Counter(
+            (d.true_class, d.reported_class)
+            for d in self.detections
+            if d.true_class and d.true_class != d.reported_class
+        )
+        bins = reliability_bins(self.detections, 1.0)
         return {
             "in_view": recall([o for o in self.objects if o.visible_fraction >= threshold]),
             "recall_by_visible_fraction": {
                 name: recall(by_visibility[name]) for name in sorted(by_visibility)
             },
-            "precision": len(recognized) / max(1, num_detections),
+            "precision": len(recognized) / max(1, len(self.detections)),
             "class_accuracy_of_found": len(recognized) / max(1, len(found)),
+            "confusions": [
+                {"true": true, "reported": reported, "count": count}
+                for (true, reported), count in confusions.most_common(MAX_CONFUSIONS)
+            ],
+            "calibration_error": expected_calibration_error(bins),
             "translation_mm": [
                 1000 * float(q) for q in np.nanquantile(translation_errors, (0.5, 0.95))
             ],
@@ -156,7 +175,16 @@ def detect_objects(
         objects.append(
             ObjectDetection(float(fraction), detection is not None, is_recognized, *errors)
         )
-    return DetectionMetrics(objects, len(detections) - len(detection_of), [seconds])
+    object_of = {id(detection): k for k, detection in detection_of.items()}
+    classified = [
+        ClassifiedDetection(
+            d.class_probabilities,
+            d.object_class.name,
+            image.classes[object_of[id(d)]] if id(d) in object_of else "",
+        )
+        for d in detections
+    ]
+    return DetectionMetrics(objects, classified, [seconds])
 
 
 def mask_iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
@@ -203,7 +231,7 @@ def evaluate_images(
     ]
     return DetectionMetrics(
         [o for part in parts for o in part.objects],
-        sum(part.num_false_positives for part in parts),
+        [d for part in parts for d in part.detections],
         [s for part in parts for s in part.seconds],
     ).to_dict()
 
@@ -217,8 +245,9 @@ def main(
         list[Path], typer.Option(metavar="FILE", help="Scene dataset with poses. May be repeated.")
     ],
     count: Annotated[
-        int, typer.Option(min=1, help="Only the first N scenes of each dataset.")
+        int, typer.Option(min=1, help="Number of scenes of each dataset, and of images.")
     ] = 100,
+    first: Annotated[int, typer.Option(min=0, help="First scene of each dataset.")] = 0,
     images: Annotated[
         Path | None,
         typer.Option(
@@ -231,21 +260,41 @@ def main(
     renderer: Annotated[
         RendererKind, typer.Option(help="Renderer of the images of the scenes.")
     ] = RendererKind.VTK,
+    textures: Annotated[
+        TextureSet | None, typer.Option(help="Random textures, by --renderer raster alone.")
+    ] = None,
+    bfloat16: Annotated[
+        bool,
+        typer.Option("--bfloat16/--float32", help="Precision of the network on a CPU."),
+    ] = HAS_FAST_BFLOAT16,
     threads: Annotated[int, typer.Option(min=1, help="Threads of PyTorch.")] = 2,
 ) -> None:
     """Evaluate a detector, and print and write its metrics."""
     torch.set_num_threads(threads)
     config = ClutterConfig()
     all_classes = load_catalog(catalog)
+    if textures is not None and renderer is RendererKind.VTK:
+        raise InputError(f"--textures {textures.value}: expected --renderer raster")
     network = SegmentationNetwork.load(detector)
-    renderers = {RendererKind.VTK: CameraRenderer, RendererKind.RASTER: SceneRasterizer}
-    camera: ImageRenderer = renderers[renderer](config.cell.camera)
+    network.use_bfloat16 = bfloat16
+    camera = config.cell.camera
+    vtk = CameraRenderer(camera) if renderer is RendererKind.VTK else None
+
+    def make_renderer(number: int) -> ImageRenderer:
+        """Return the renderer of a scene."""
+        vary = None if textures is None else TextureVariation(number, textures)
+        return vtk or SceneRasterizer(camera, vary_mesh=vary)
+
     rows = dict[str, Any]()
     for path in scenes:
         dataset = load_scene_dataset(path, all_classes)
-        numbers = range(min(count, len(dataset.scenes)))
+        numbers = range(first, min(first + count, len(dataset.scenes)))
+        if not numbers:
+            raise InputError(
+                f"--first {first}: expected less than the {len(dataset.scenes)} scenes of {path}"
+            )
         rendered = [
-            render_image(camera, dataset.settled_scene(k, dataset.grammar, config))
+            render_image(make_renderer(k), dataset.settled_scene(k, dataset.grammar, config))
             for k in progress(numbers, path.stem)
         ]
         class_names = [c.name for c in dataset.classes]
@@ -261,8 +310,12 @@ def main(
             "trained": load_checkpoint(detector).metadata["metrics"],
             **provenance(),
             "seed": seed,
+            "first": first,
             "count": count,
             "renderer": renderer.value,
+            "textures": None if textures is None else textures.value,
+            "bfloat16": bfloat16,
+            "threads": threads,
             "rows": rows,
             "config": to_plain(config),
         },

@@ -4,7 +4,8 @@
     python training/train_detector.py --config training/configs/detector.yaml --out runs/detector
 
 An interrupted run is resumed by the same command, and ends with the same weights as an
-uninterrupted one.
+uninterrupted one. With --minutes it interrupts itself after that time, so that a training of hours
+is done in several sessions.
 """
 
 from collections.abc import Sequence
@@ -72,6 +73,7 @@ class DetectorTrainingConfig:
             have other object classes, and no color.
         seed: Random seed; equal seeds give equal weights on the same kind of machine.
         evaluate_every: Steps between two evaluations.
+        save_every: Steps between two saved states, the last of which an interrupted run resumes.
         learning: Hyperparameters of the training.
         cell: Work cell, whose camera and support the images show.
     """
@@ -84,6 +86,7 @@ class DetectorTrainingConfig:
     warm_start: str = ""
     seed: Seed = 0
     evaluate_every: Count = 250
+    save_every: Count = 100
     learning: SegmentationConfig = field(default_factory=SegmentationConfig)
     cell: WorkCell = field(default_factory=default_cell)
 
@@ -153,6 +156,9 @@ def main(
     catalog: CatalogOption = None,
     device: DeviceOption = "auto",
     threads: Annotated[int, typer.Option(min=1, help="Threads of PyTorch on a CPU.")] = 2,
+    minutes: Annotated[
+        float | None, typer.Option(min=0, help="Interrupt the training after this time.")
+    ] = None,
 ) -> None:
     """Train a detector and write detector.safetensors."""
     training = load_config_as(
@@ -205,7 +211,8 @@ def main(
         train_iteration=learner.train_iteration,
         evaluate=evaluate,
         evaluate_every=training.evaluate_every,
-        save_every=training.evaluate_every,
+        save_every=training.save_every,
+        max_minutes=minutes,
     )
 
 

@@ -1,5 +1,6 @@
 """Training loop and common options of the scripts that train networks."""
 
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,6 +56,7 @@ def train_to_end(
     evaluate: Callable[[], tuple[Metrics, Metrics]],
     evaluate_every: int,
     save_every: int,
+    max_minutes: float | None = None,
 ) -> None:
     """Train, evaluate and save until the learner has made all steps; write the checkpoints.
 
@@ -70,8 +72,14 @@ def train_to_end(
         evaluate: Returns metrics of the network, and losses.
         evaluate_every: Steps between two evaluations. The last step is always evaluated.
         save_every: Steps between two saved states. The last step is always saved.
+        max_minutes: Time after which the training is interrupted with a saved state; None: never.
     """
+    deadline = None if max_minutes is None else time.monotonic() + 60 * max_minutes
     while learner.step < total_steps:
+        if deadline is not None and time.monotonic() > deadline:
+            run.save()
+            print(f"interrupted after {learner.step} of {total_steps} steps; resumed when repeated")
+            return
         before = learner.step
         train_iteration()
         run.check_convergence()

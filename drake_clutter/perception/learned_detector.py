@@ -14,6 +14,7 @@ from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.support import Support
 from drake_clutter.files import InputError
+from drake_clutter.perception.calibration import apply_temperature
 from drake_clutter.perception.hypothesis_refinement import (
     MIN_SEGMENT_CELLS,
     Mask,
@@ -45,6 +46,12 @@ from drake_clutter.scenes.geometry import penetration_depth
 from drake_clutter.scenes.interfaces import Detection, Observation
 from drake_clutter.scenes.scene import Pose, SceneObject
 
+MIN_MEASURED_FRACTION = 0.1
+"""Smallest fraction of pixels over the support with a measured depth.
+
+The noise model of the D435 leaves at least 0.9. Below this bound an empty tray could not be
+told from a tray that is not seen.
+"""
 MIN_SCORE = 0.3
 """Smallest score of a fitted pose that may become a detection."""
 CONFIDENT_SCORE = 0.6
@@ -122,9 +129,15 @@ def _select_candidates(
 ) -> list[_Candidate]:
     """Return the candidates that together explain an image best and do not penetrate each other."""
     objects = [SceneObject(str(k), c.object_class, c.fitted.X_TO) for k, c in enumerate(candidates)]
+    bounds = [o.bounds_T for o in objects]
 
     @cache
     def conflict(a: int, b: int) -> bool:
+        # Objects whose bounding boxes overlap less penetrate less, too.
+        (lower_a, upper_a), (lower_b, upper_b) = bounds[a], bounds[b]
+        overlap = np.minimum(upper_a, upper_b) - np.maximum(lower_a, lower_b)
+        if overlap.min() <= MAX_PENETRATION:
+            return False
         return penetration_depth(objects[a], objects[b]) > MAX_PENETRATION
 
     indices = select_consistent_poses(
@@ -196,8 +209,13 @@ class LearnedDetector:
             The detections, whose names number the objects of each class in this image, and the
             depth image. Depth of detected objects and of the floor is that of their models, without
             noise, and holes are filled.
+
+        Raises:
+            InputError: An image does not have the camera's size, or depth is measured nearly
+                nowhere over the support: the camera is covered or broken.
         """
         window, network = self._window, self._network
+        self._check_images(depth, color)
         p_TP = backproject_window(depth, self._camera, window)
         predictions = self._predict(p_TP, color)
         segments = extract_segments(
@@ -232,6 +250,22 @@ class LearnedDetector:
                 masks = [half for mask in masks for half in split_mask(mask, predictions.votes_T)]
             candidates += self._fit(self._propose_segments(masks, predictions, depth.shape), depth)
         return self._observation(depth, _select_candidates(candidates, depth.shape), predictions)
+
+    def _check_images(self, depth: NDArray[np.float32], color: NDArray[np.uint8]) -> None:
+        """Check sizes, and that the camera sees something; see `detect`."""
+        size = (self._camera.height, self._camera.width)
+        if depth.shape != size or color.shape != (*size, 3):
+            raise InputError(
+                f"depth and color image: shapes {depth.shape} and {color.shape}; "
+                f"expected {size} and {(*size, 3)}, the size of the camera"
+            )
+        shown = depth[self._window.rows, self._window.columns]
+        fraction = np.count_nonzero(np.isfinite(shown) & (shown > 0)) / shown.size
+        if fraction < MIN_MEASURED_FRACTION:
+            raise InputError(
+                f"depth image: {100 * fraction:.0f} % of the pixels over the support are measured; "
+                f"expected at least {100 * MIN_MEASURED_FRACTION:.0f} %, is the camera covered?"
+            )
 
     def _predict(self, p_TP: NDArray[np.float32], color: NDArray[np.uint8]) -> _CellPredictions:
         """Return the network's predictions.
@@ -293,7 +327,7 @@ class LearnedDetector:
     def _class_probabilities(
         self, predictions: _CellPredictions, cells: NDArray[np.bool_]
     ) -> dict[str, float]:
-        """Return the mean class probabilities of the cells of a detection, see `Detection`."""
+        """Return the calibrated class probabilities of a detection, given its cells."""
         if not cells.any():
             return {}
         mean = predictions.class_probabilities[:, cells].mean(axis=1)
@@ -302,7 +336,8 @@ class LearnedDetector:
             for name, p in zip(self._network.classes, mean, strict=True)
             if name in self._classes
         }
-        return named | {"": max(0.0, 1.0 - sum(named.values()))}
+        named[""] = max(0.0, 1.0 - sum(named.values()))
+        return apply_temperature(named, self._network.temperature)
 
     def _propose_segments(
         self, masks: Sequence[Mask], predictions: _CellPredictions, image_shape: tuple[int, int]
