@@ -67,7 +67,7 @@ def test_an_episode_ends_without_a_move(config: ClutterConfig) -> None:
     observation = shifted_observation(COVERED, config, 0.0)
     backend = ImageBackend(COVERED, lambda *_: observation, seed=0, config=config)
     task = run_episode(backend, lambda *_: Decision(None), max_moves=3)
-    assert (task.transitions, task.termination) == ([], None)
+    assert (task.transitions, task.termination) == ([], TerminationReason.GAVE_UP)
 
 
 def test_summary_of_closed_loop_episodes() -> None:

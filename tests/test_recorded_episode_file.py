@@ -187,7 +187,7 @@ def replace_dataset(file: h5py.Group, name: str, values: np.ndarray) -> None:
         ),
         (
             lambda f: replace_dataset(f, "action_0002/phase", np.full(3, 99, np.int16)),
-            r"action_0002.phase: expected integers in \[-1, 11\]",
+            r"action_0002.phase: expected integers in \[-1, 12\]",
         ),
         (
             lambda f: replace_dataset(f, "action_0002/X_TG", np.zeros((NUM_SAMPLES, 7))),
