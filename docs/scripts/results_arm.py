@@ -24,6 +24,8 @@ GRASPS = {"JointHold": "weld (locked joint)", "HexapodHold": "compliant (hexapod
 """Grasp constraints by their names in results files of version 0.1."""
 SPEED = "simulation_speed.json"
 """Results file of the time of simulated moves."""
+PLANNING = "planning_speed.json"
+"""Results file of `benchmarks/planning_speed.py`."""
 CUPS = "cup_sensitivity.json"
 """Results file of the effect of the numbers of suction cups."""
 CLONING = "reaching_policies.json"
@@ -273,6 +275,41 @@ def _peers() -> str:
     return text + table(columns, body)
 
 
+def _planning() -> str:
+    results = read_benchmark_results(PLANNING)
+    text = section(
+        "Time of a plan",
+        f"{results['count']} random moves in scenes of 25 nodes, planned in turn by an earlier "
+        "version and by this one, on one core; processor time of the moves that were planned. "
+        "*Lost*, *gained*: moves that only the earlier version plans, and only this one.",
+        command=f"python {results['command']} --baseline DIR --out FILE",
+        seed="that of `benchmarks/planning_problems.py`, in the name of the file",
+        results=[f"benchmarks/results/{PLANNING}"],
+    )
+    rows = list[list[str]]()
+    for kind, row in results["rows"].items():
+        ratio = row["after / before"]
+        rows += [
+            [
+                f"{kind}, median / 95th [ms]",
+                *(quantiles(row[version]["seconds"], 1, 1000) for version in ("before", "after")),
+                quantiles(ratio["seconds"], 2),
+            ],
+            [
+                f"{kind}, mean duration of the motion",
+                "",
+                "",
+                number(ratio["mean_duration"]),
+            ],
+            [
+                f"{kind}, planned",
+                *(_fraction(row[version]["planned"]) for version in ("before", "after")),
+                f"lost {ratio['lost']}, gained {ratio['gained']}",
+            ],
+        ]
+    return text + table(["", "before", "after", "after / before"], rows)
+
+
 def _speed() -> str:
     results = read_benchmark_results(SPEED)
     rows = results["rows"]
@@ -385,6 +422,8 @@ def page() -> str:
     sections = [_moves(), _limits(), _parts(), _grasps(), _grippers()]
     if has_benchmark_results(PEERS):
         sections.append(_peers())
+    if has_benchmark_results(PLANNING):
+        sections.append(_planning())
     if has_benchmark_results(SPEED):
         sections.append(_speed())
     if has_benchmark_results(CUPS):
