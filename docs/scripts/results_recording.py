@@ -1,7 +1,13 @@
 """The page docs/results/recording.md."""
 
+import json
+
 from markdown_text import number, section, table
-from results_files import read_benchmark_results
+from results_files import ROOT, read_benchmark_results
+
+DATASET = "training/datasets/sg_star_25_moves"
+"""Folder of the card of the recorded data set."""
+SUMMARY_FILE = "summary.json"
 
 IMAGES = {"none": "none", "RGB-D": "color and depth"}
 """Names of the kinds of images, by those in the results file."""
@@ -51,7 +57,7 @@ def page() -> str:
         "measured, and a single process reads all episodes for the card at the end. See "
         "`benchmarks/recording_throughput.py`.\n\n"
     )
-    return text + table(
+    text += table(
         ["images", "workers", "hours", "moves per hour", "core hours per 1,000 moves"],
         [
             [
@@ -62,6 +68,36 @@ def page() -> str:
                 number(row["core_hours_per_1000_moves"]),
             ]
             for row in results["model"]
+        ],
+    )
+    if (ROOT / DATASET / SUMMARY_FILE).exists():
+        text += "\n" + _dataset()
+    return text
+
+
+def _dataset() -> str:
+    """Return the section of the data set whose card is published."""
+    summary = json.loads((ROOT / DATASET / SUMMARY_FILE).read_text())
+    text = section(
+        "A recorded data set",
+        "Random legal moves of the arm with color, depth and segmentation images of the overhead "
+        f"camera. `{DATASET}/README.md` is the card of the data set, with its pictures; the data "
+        "are made by the command.",
+        command="python training/record_sg_star_dataset.py --workers 2 --out FOLDER",
+        seed="0",
+        results=[f"{DATASET}/{SUMMARY_FILE}"],
+    )
+    results = ", ".join(f"{count:,} {result}" for result, count in summary["results"].items())
+    return text + table(
+        ["episodes", "attempted moves", "carried out", "results", "motion"],
+        [
+            [
+                f"{summary['episodes']:,}",
+                f"{summary['moves']:,}",
+                f"{summary['executed_moves']:,}",
+                results,
+                f"{summary['recorded_seconds'] / 3600:.1f} h",
+            ]
         ],
     )
 
