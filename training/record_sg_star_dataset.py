@@ -5,9 +5,10 @@
 
 Random legal moves of the arm, five in an episode, with color, depth and segmentation of the
 overhead camera at 10 Hz. `train_bc.py` learns from them. The card, `README.md` with its pictures,
-and `summary.json` are copied to the folder of `--card`; the data stays in FOLDER. An interrupted
-run is resumed by the same command. The scenes are those of an evaluation: an explorer that is
-trained on them is not to be evaluated on `sg_star_25`.
+and the options, `job.json`, are copied to the folder of `--card`, and `summary.json` with the
+commit of this software; the data stays in FOLDER. An interrupted run is resumed by the same
+command. The scenes are those of an evaluation: an explorer that is trained on them is not to be
+evaluated on `sg_star_25`.
 """
 
 import math
@@ -19,11 +20,14 @@ from typing import Annotated
 import typer
 
 from drake_clutter.commands.episode_scenes import find_scenes
+from drake_clutter.commands.job_file import JOB_FILE
 from drake_clutter.commands.record_dataset import SUMMARY_FILE, record_dataset
 from drake_clutter.commands.recording_job import CameraOptions, RecordingJob
 from drake_clutter.config import load_config
+from drake_clutter.files import write_json
 from drake_clutter.recording.camera_recorder import CameraChannel
 from drake_clutter.reports.dataset_card import CARD_FILE, CONTACT_SHEET_FILE, FIGURES_FILE
+from training.results_file import provenance
 from training.script import Item, SeedOption, WorkersOption, progress, run_script
 
 SCENES = "sg_star_25"
@@ -76,8 +80,9 @@ def main(
         episodes = max(episodes + 1, math.ceil(episodes * moves / max(executed, 1)))
     if card is not None:
         card.mkdir(parents=True, exist_ok=True)
-        for name in (CARD_FILE, CONTACT_SHEET_FILE, FIGURES_FILE, SUMMARY_FILE):
+        for name in (CARD_FILE, CONTACT_SHEET_FILE, FIGURES_FILE, JOB_FILE):
             shutil.copyfile(out / name, card / name)
+        write_json(card / SUMMARY_FILE, {**provenance(), **summary})
     print(f"{executed} of {summary['moves']} moves carried out in {episodes} episodes")
 
 
