@@ -21,7 +21,7 @@ import typer
 
 from drake_clutter.commands.episode_scenes import find_scenes
 from drake_clutter.commands.job_file import JOB_FILE
-from drake_clutter.commands.record_dataset import SUMMARY_FILE, record_dataset
+from drake_clutter.commands.record_dataset import EPISODES_FOLDER, SUMMARY_FILE, record_dataset
 from drake_clutter.commands.recording_job import CameraOptions, RecordingJob
 from drake_clutter.config import load_config
 from drake_clutter.files import write_json
@@ -68,7 +68,8 @@ def main(
     def show(label: str, items: Iterable[Item], num_done: int, total: int) -> Iterable[Item]:
         return progress(items, label, total, num_done)
 
-    episodes = math.ceil(moves / MAX_MOVES)
+    num_recorded = len(list((out / EPISODES_FOLDER).glob("episode_*.h5")))
+    episodes = max(math.ceil(moves / MAX_MOVES), num_recorded)
     while True:
         summary = record_dataset(
             job, episodes, [], out, command=COMMAND, workers=workers, progress=show
