@@ -82,28 +82,29 @@ class Timing:
 
 def time_dataset(job: RecordingJob, episodes: int, workers: int) -> Timing:
     """Record a data set and return its times."""
-    arrivals = list[tuple[float, int]]()
+    moves = list[int]()
 
     def watch(label: str, items: Iterable[Any], num_done: int, total: int) -> Iterator[Any]:
         for item in items:
             if isinstance(item, EpisodeSummary):
-                arrivals.append((time.perf_counter(), item.num_executed))
+                moves.append(item.num_executed)
             yield item
 
-    begin = time.perf_counter()
+    begin = time.time()
     with tempfile.TemporaryDirectory() as folder:
         record_dataset(job, episodes, [], Path(folder), workers=workers, progress=watch)
-        end = time.perf_counter()
+        end = time.time()
+        # Summaries arrive in the order of the episodes; the files tell when each was complete.
+        files = [episode_path(Path(folder), k) for k in range(episodes)]
+        complete = sorted((file.stat().st_mtime, n) for file, n in zip(files, moves, strict=True))
     # The first episode of each worker compiles and loads what the others find.
-    first = min(workers, len(arrivals) - 1)
-    counted = sum(moves for _, moves in arrivals[first:])
-    span = arrivals[-1][0] - arrivals[first - 1][0]
+    first = min(workers, episodes - 1)
     return Timing(
-        moves=sum(moves for _, moves in arrivals),
-        start=arrivals[first - 1][0] - begin,
-        recording=span,
-        counted=counted,
-        finish=end - arrivals[-1][0],
+        moves=sum(moves),
+        start=complete[first - 1][0] - begin,
+        recording=complete[-1][0] - complete[first - 1][0],
+        counted=sum(n for _, n in complete[first:]),
+        finish=end - complete[-1][0],
     )
 
 
