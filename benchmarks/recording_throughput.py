@@ -28,7 +28,12 @@ import typer
 from benchmarks.measurement import Stopwatch, describe_machine
 from drake_clutter.commands import record_dataset as recording
 from drake_clutter.commands.episode_scenes import find_scenes
-from drake_clutter.commands.record_dataset import EpisodeSummary, EpisodeWriter, record_dataset
+from drake_clutter.commands.record_dataset import (
+    EpisodeSummary,
+    EpisodeWriter,
+    episode_path,
+    record_dataset,
+)
 from drake_clutter.commands.recording_job import CameraOptions, RecordingJob
 from drake_clutter.config import load_config
 from drake_clutter.files import write_json
