@@ -136,7 +136,7 @@ class StoppingRunner:
         policy = StoppingPolicy(
             self._make_policy(backend),
             self._scenes.classes,
-            config.cell.camera.floor_depth,
+            backend.empty_depth,
             config.exploration.belief,
         )
         task = run_episode(backend, policy, max_moves=self._max_moves, until=StopCriterion.BELIEF)
@@ -214,6 +214,8 @@ def episodes(
         raise InputError(f"--fidelity {fidelity}; expected {', '.join(FIDELITIES)}")
     if perception != PERFECT and fidelity != "settle":
         raise InputError(f"--fidelity {fidelity}; expected settle with images")
+    if first + count > MAX_SCENES:
+        raise InputError(f"--count {count}: expected at most {MAX_SCENES - first} from --first")
     assert out is not None
     folder = out.with_suffix("")
     folder.mkdir(parents=True, exist_ok=True)
@@ -233,7 +235,7 @@ def episodes(
         schema=StoppingRecord,
         workers=workers,
     )
-    row = key | summarize(records)
+    row = key | {"first": first} | summarize(records)
     results.add(row)
     print_table([table_row(row)])
 

@@ -14,6 +14,7 @@ FOLDERS = (
     "training/scenes",
     "training/targets",
     "training/checkpoints",
+    "training/datasets",
 )
 COMMIT = re.compile(rb'"commit": *"([0-9a-f]{7,40})(?:-dirty)?"')
 NOT_IN_HISTORY = {"788e581": "training/results/second_trainings.json"}

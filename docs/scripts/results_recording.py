@@ -84,7 +84,7 @@ def _dataset() -> str:
         f"camera. `{DATASET}/README.md` is the card of the data set, with its pictures; the data "
         "are made by the command.",
         command="python training/record_sg_star_dataset.py --workers 2 --out FOLDER",
-        seed="0",
+        seed=json.loads((ROOT / DATASET / "job.json").read_text())["seed"],
         results=[f"{DATASET}/{SUMMARY_FILE}"],
     )
     results = ", ".join(f"{count:,} {result}" for result, count in summary["results"].items())

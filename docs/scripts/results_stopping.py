@@ -11,16 +11,17 @@ def stopping() -> str:
     text = section(
         "Stopping without ground truth",
         "Explorers that stop when their [belief](../explanation/belief.md) says that every object "
-        "is known; at most 20 moves. Scenes 100 to 159 of sg_star_25, 0 to 99 of sg_14. "
+        "is known; at most 20 moves. "
         "*Right*: stopped with every object found, of all episodes. *Too early*: stopped with an "
         "object hidden. *Unneeded moves*: after every object was in view, mean of the episodes in "
         "which it was. Detector `labels` is perfect. Intervals are 95 %.",
-        command="python benchmarks/stopping.py episodes --fidelity static_or_drake --first 100"
-        " --count 60 --out benchmarks/results/stopping.json",
+        command="python benchmarks/stopping.py episodes --set DATASET --agent POLICY "
+        "--fidelity static_or_drake --first FIRST --count SCENES --out FILE",
         seed=results["seed"],
         results=["benchmarks/results/stopping.json", "benchmarks/results/hidden_rates.json"],
     )
-    head = ["dataset", "policy", "detector", "moves judged by", "scenes", "right", "all found"]
+    head = ["dataset", "policy", "detector", "moves judged by", "first scene", "scenes"]
+    head += ["right", "all found"]
     head += ["too early", "unneeded moves"]
     body = [
         [
@@ -28,6 +29,7 @@ def stopping() -> str:
             policy_name(row["agent"]),
             row["perception"],
             row["fidelity"],
+            str(row["first"]),
             str(row["episodes"]),
             estimate(row, "right", "right_ci95"),
             number(row["found_all"]),

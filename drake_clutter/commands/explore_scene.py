@@ -119,8 +119,8 @@ def explore_scene(
     if target is not None and retrieve:
         policy = RetrievingExplorer(policy, target, config.cell, config.exploration)
     if until is StopCriterion.BELIEF:
-        empty_depth = config.cell.camera.floor_depth
-        policy = StoppingPolicy(policy, classes, empty_depth, config.exploration.belief)
+        belief = config.exploration.belief
+        policy = StoppingPolicy(policy, classes, backend.empty_depth, belief)
     return run_episode(
         backend,
         policy,

@@ -1,10 +1,12 @@
 """Exploration episodes, and backends that execute the moves of a policy."""
 
 from collections.abc import Callable, Generator, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_clutter.config import ClutterConfig, ExplorationConfig
 from drake_clutter.files import InputError
@@ -179,6 +181,11 @@ class SteppedBackend:
     def outcome_rng(self) -> np.random.Generator:
         """Random generator of the placement and the outcome of the next move."""
         return self._rng
+
+    @property
+    def empty_depth(self) -> NDArray[np.float32]:
+        """Depth image of the cell without objects [m]. Shape (H, W)."""
+        return self._detector.perceive(replace(self.scene, objects=())).observation.depth
 
     def observe(self) -> Observation:
         """Return the current observation."""
