@@ -121,7 +121,7 @@ def test_an_object_is_dropped_if_the_vacuum_is_too_weak(plan: PickPlacePlan) -> 
     """The plan assumes a vacuum of 80 %; the simulation has 10 %, or 5 N for a weight of 5 N."""
     result = run(plan, cell_with("gripper.vacuum=0.1"))
     assert result.grasped
-    on = build_command_schedule(plan, DEFAULT_CELL).grasp_time
+    on = build_command_schedule(plan, DEFAULT_CELL).start_of("grasp")
     assert on < result.drop_time < on + DWELL_TIME + 0.5, "as soon as it is lifted"
     assert result.position_error > 0.2
 
@@ -248,7 +248,7 @@ def test_stages_of_the_command_schedule(plan: PickPlacePlan) -> None:
     ]
     assert schedule.end_time == pytest.approx(plan.duration + 2 * DWELL_TIME)
     assert schedule.stage_at(0.0) == "approach"
-    assert schedule.stage_at(schedule.grasp_time) == "grasp"
+    assert schedule.stage_at(schedule.start_of("grasp")) == "grasp"
     assert schedule.stage_at(schedule.release_time + 0.01) == "release"
     assert schedule.stage_at(schedule.end_time) == "idle"
     home = np.concatenate([DEFAULT_CELL.robot.home, np.zeros(6)])

@@ -72,13 +72,13 @@ def test_piles_are_affected_if_they_are_near_not_if_their_bounding_boxes_meet(
 def test_objects_are_woken_around_pick_and_place(plan: PickPlacePlan) -> None:
     schedule = build_command_schedule(plan, DEFAULT_CELL)
     descent_start = schedule.start_of("descend")
-    carried = (schedule.grasp_time + DWELL_TIME + descent_start) / 2
+    carried = (schedule.start_of("grasp") + DWELL_TIME + descent_start) / 2
     at_place = {"descend": {"place"}, "release": {"place"}}
     affected = [({"grasp": {"pick"}} | at_place).get(step.name, set()) for step in plan.steps]
     for time, expected in (
         (0.0, set()),
-        (schedule.grasp_time, {"pick"}),
-        (schedule.grasp_time + DWELL_TIME, {"pick"}),
+        (schedule.start_of("grasp"), {"pick"}),
+        (schedule.start_of("grasp") + DWELL_TIME, {"pick"}),
         (carried, set()),
         (descent_start, {"place"}),
         (schedule.release_time, {"place"}),

@@ -43,22 +43,27 @@ class CommandSchedule:
     end_time: float
     gripper_targets: tuple[tuple[float, Floats], ...]
 
-    @property
-    def grasp_time(self) -> float:
-        """Time at which a tool first holds or grasps an object [s]; infinite if none does."""
-        starts = zip(self.starts, self.steps, strict=True)
-        return next((start for start, step in starts if step.tool), math.inf)
+    def held_time(self, time: float) -> float:
+        """Return from when on the object is held whose grasp began last [s]: the end of its dwell.
 
-    @property
-    def held_time(self) -> float:
-        """Time from which a tool holds its object [s]: the end of the dwell of the grasp.
+        Vacuum has to build up, and jaws have to close.
 
-        Vacuum has to build up, and jaws have to close. Infinite if no object is grasped.
+        Args:
+            time: Time since the start of the plan [s].
+
+        Returns:
+            The time [s]; infinite if no grasp has begun.
         """
+        tools = ("", *(step.tool for step in self.steps))
         ends = (*self.starts[1:], self.end_time)
-        return next(
-            (end for end, step in zip(ends, self.steps, strict=True) if step.tool), math.inf
-        )
+        begun = [
+            end
+            for start, end, before, tool in zip(
+                self.starts, ends, tools[:-1], tools[1:], strict=True
+            )
+            if tool and not before and start <= time
+        ]
+        return begun[-1] if begun else math.inf
 
     @property
     def release_time(self) -> float:

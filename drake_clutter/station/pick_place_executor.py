@@ -56,7 +56,8 @@ class ExecutorState(Message):
             before.
         contact_time: Time between the start of the guarded descent and contact [s]; infinite
             without contact.
-        waited: Time for which the arm has waited for the vacuum, beyond the planned dwell [s].
+        waited: Time for which the arm has waited for the vacuum, beyond the planned dwells [s].
+        grip_wait: The part of it at the current grasp [s].
         has_no_seal: Whether no vacuum has built up, so that the arm goes back without the object.
     """
 
@@ -66,6 +67,7 @@ class ExecutorState(Message):
     bellows_extension: float = math.nan
     contact_time: float = math.inf
     waited: float = 0.0
+    grip_wait: float = 0.0
     has_no_seal: bool = False
 
     @property
@@ -234,18 +236,24 @@ class PickPlaceExecutor(LeafSystem):
         elapsed = state.elapsed(context.get_time())
         tool = schedule.tool_at(elapsed)
         ends_before_next_update = schedule.stage_at(elapsed + EXECUTOR_UPDATE_PERIOD) != "grasp"
-        if schedule.stage_at(elapsed) != "grasp" or not tool or not ends_before_next_update:
+        if schedule.stage_at(elapsed) != "grasp":
+            return replace(state, grip_wait=0.0) if state.grip_wait else state
+        if not tool or not ends_before_next_update:
             return state
         vacuum = float(self._vacuum.Eval(context)[list(self._tools).index(tool)])
         if vacuum >= gripper.lift_vacuum * gripper.full_vacuum:
             return state
-        if state.waited + EXECUTOR_UPDATE_PERIOD > gripper.grip_timeout:
+        if state.grip_wait + EXECUTOR_UPDATE_PERIOD > gripper.grip_timeout:
             if vacuum >= gripper.detection_vacuum:
                 return state
             assert state.plan is not None
             withdrawal = build_withdrawal_schedule(schedule, state.plan, self._cell, elapsed)
             return replace(state, schedule=withdrawal, has_no_seal=True)
-        return replace(state, waited=state.waited + EXECUTOR_UPDATE_PERIOD)
+        return replace(
+            state,
+            waited=state.waited + EXECUTOR_UPDATE_PERIOD,
+            grip_wait=state.grip_wait + EXECUTOR_UPDATE_PERIOD,
+        )
 
     def _detect_contact(self, context: Context, state: ExecutorState) -> ExecutorState:
         """Return the state, updated if contact occurs during a guarded descent."""

@@ -311,11 +311,6 @@ class StationSimulation:
         return int(port.Eval(self.executor.GetMyContextFromRoot(self.root))[0])
 
     @property
-    def is_executing(self) -> bool:
-        """Whether a plan is executed."""
-        return not self.executor_state.has_ended(self.root.get_time())
-
-    @property
     def is_at_rest(self) -> bool:
         """Whether no plan is executed, and none was within `SETTLE_TIME`."""
         return self._num_steps * STEP_PERIOD >= self.executor_state.end_time + SETTLE_TIME
@@ -343,7 +338,8 @@ class StationSimulation:
             elapsed = self.root.get_time() - state.start_time - state.waited
             required = bodies_to_wake(state.schedule, self._affected, elapsed)
             end = state.schedule.end_time + POST_MOTION_WAIT
-            expects_grasp = state.schedule.held_time + STEP_PERIOD <= elapsed < end
+            held_time = state.schedule.held_time(elapsed)
+            expects_grasp = held_time + STEP_PERIOD <= elapsed < end and not state.has_no_seal
         self._sleep.update(self.root, required, self.gripper.status, expects_grasp=expects_grasp)
         start = self._num_steps * STEP_PERIOD + _TIME_MARGIN
         for k in range(_GRIPPER_UPDATES_PER_STEP):

@@ -204,10 +204,13 @@ class ClosedLoop:
         self.policy_system.policy = policy
         self._start_time = time.perf_counter()
         samples: ActionSamples | None = None
-        state = self._state
+        state, response = self._state, self._response
         while state.phase is not PolicyPhase.DONE:
             samples = self._advance() or samples
             previous, state = state, self._state
+            if self._response.number != response.number:
+                response = self._response
+                self._planning_time += response.plan.planning_time if response.plan else 0.0
             is_done = state.phase is PolicyPhase.DONE
             # A request for another grasp follows from the same decision.
             has_observed = is_done or state.decision is not previous.decision
@@ -271,7 +274,6 @@ class ClosedLoop:
         plan = self._response.plan
         assert decision is not None
         assert plan is not None
-        self._planning_time += plan.planning_time
         if self._perceive is not None:
             observation = state.request.observation
             assert observation is not None
