@@ -102,8 +102,9 @@ def main(
         workers=workers,
     )
     pairs = [TargetPair(**record["pair"]) for record in records]
-    metadata = {"seed": seed, "budget": BUDGET, **provenance()}
-    save_target_set(out, metadata | {"commit": records[0]["commit"]}, dataset, pairs)
+    commits = {"commits": list(dict.fromkeys(record["commit"] for record in records))}
+    metadata = {"seed": seed, "budget": BUDGET, **provenance(), **commits}
+    save_target_set(out, metadata, dataset, pairs)
     work.unlink()
 
 

@@ -217,8 +217,12 @@ class ClosedLoop:
             if has_observed and previous.request.number:
                 yield self._attempt(previous, samples)
                 samples = None
-        assert state.decision is not None
-        return state.decision
+        decision = state.decision
+        assert decision is not None
+        if self._perceive is not None:
+            known = self.belief.objects
+            decision = to_ground_truth_names(decision, known, None, self.scene.objects)
+        return decision
 
     def _advance(self) -> ActionSamples | None:
         """Advance by a step or over a whole motion; return the samples of one that has ended.

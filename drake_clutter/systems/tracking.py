@@ -166,23 +166,27 @@ def match_to_ground_truth(
 def to_ground_truth_names(
     decision: Decision,
     known: Sequence[SceneObject],
-    observation: Observation,
+    observation: Observation | None,
     objects: Sequence[SceneObject],
 ) -> Decision:
     """Return a decision in the names of the true objects.
 
     Args:
-        decision: Decision with a move, in the names of the belief.
+        decision: Decision in the names of the belief.
         known: Objects of the belief (K_t) at the decision. Each is taken for the nearest true
             object.
         observation: Observation at the decision, which becomes part of the result.
         objects: True objects.
     """
-    assert decision.move is not None
     name = {TRAY: TRAY} | {o.name: nearest_object(objects, o.X_TO).name for o in known}
+    move, hidden = decision.move, decision.hidden
+    if hidden is not None:
+        carried = (replace(s, carried=name[s.carried]) for s in hidden.supports)
+        hidden = replace(hidden, supports=tuple(carried))
     return replace(
         decision,
-        move=Move(name[decision.move.pick], name[decision.move.place]),
+        move=None if move is None else Move(name[move.pick], name[move.place]),
+        hidden=hidden,
         pick_probabilities={
             name[pick]: probability for pick, probability in decision.pick_probabilities.items()
         },

@@ -45,8 +45,7 @@ class Decision:
         considered: Names of the objects that the choice was based on; empty for those in view.
         observation: Observation that the choice was based on, if it is not that of a perfect
             detector.
-        hidden: What unseen space may hold, with the names of the belief; None if the policy does
-            not estimate it.
+        hidden: What unseen space may hold; None if the policy does not estimate it.
         is_stop: Whether the policy stops because nothing is left to be found.
     """
 
