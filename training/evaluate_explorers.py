@@ -234,6 +234,33 @@ def evaluate_set(
     return rows
 
 
+def check_evaluation(
+    fidelity: str, out: Path | None, is_published_folder: bool, is_part: bool
+) -> str:
+    """Return the current name of a fidelity if an evaluation leaves published results whole.
+
+    Args:
+        fidelity: Model of the moves.
+        out: Results file; None for the published ones.
+        is_published_folder: Whether the records are among the published ones.
+        is_part: Whether only some policies or scenes are evaluated.
+
+    Raises:
+        InputError: A published file would get other results, or the fidelity is unknown.
+    """
+    fidelity = current_fidelity(fidelity)
+    if fidelity not in FIDELITIES:
+        raise InputError(f"--fidelity {fidelity}; expected {', '.join(FIDELITIES)}")
+    if is_published_folder and fidelity != "settle":
+        raise InputError("DIR: is for episodes under settle; give another folder")
+    if out is None and (is_part or fidelity != "settle"):
+        raise InputError(
+            "--out: is missing; the published tables are all agents' on all scenes under settle:"
+            " give a file for others"
+        )
+    return fidelity
+
+
 def main(
     folder: Annotated[
         Path, typer.Argument(metavar="DIR", help="Folder for the records of the episodes.")
@@ -260,16 +287,7 @@ def main(
 
     Without --out, the rows go into table2.json and table3.json in training/results.
     """
-    fidelity = current_fidelity(fidelity)
-    if folder == EPISODES and fidelity != "settle":
-        raise InputError(f"DIR: {folder}: is for episodes under settle; give another folder")
-    if out is None and (agents or count or fidelity != "settle"):
-        raise InputError(
-            "--out: is missing; the published tables are all agents' on all scenes under settle:"
-            " give a file for others"
-        )
-    if fidelity not in FIDELITIES:
-        raise InputError(f"--fidelity {fidelity}; expected {', '.join(FIDELITIES)}")
+    fidelity = check_evaluation(fidelity, out, folder == EPISODES, bool(agents or count))
     names = [name for name in TABLES if only is None or only in name]
     if not names:
         raise InputError(f"--only {only}; expected a part of one of {', '.join(TABLES)}")

@@ -27,7 +27,7 @@ from drake_clutter.statistics import mean_interval, ratio_interval, wilson_inter
 from drake_clutter.tasks.exploration_task import TerminationReason
 from drake_clutter.tasks.oracle_search import Solvability
 from drake_clutter.validation import to_plain
-from training.evaluate_explorers import EpisodeRecord, episodes_path
+from training.evaluate_explorers import EpisodeRecord, check_evaluation, episodes_path
 from training.results_file import ResultsFile, Row, collect_records
 from training.script import (
     RESULTS,
@@ -102,16 +102,17 @@ def is_revealed(result: EpisodeResult) -> bool:
     return result.ended == TerminationReason.TARGET_FOUND.value
 
 
-def moves_ratio(pairs: Sequence[tuple[int, int]]) -> Row:
+def moves_ratio(pairs: Sequence[tuple[int, int]], least: tuple[int, int] = (1, MAX_MOVES)) -> Row:
     """Return the ratio of two policies' moves, with its interval and the number of episodes.
 
     Args:
         pairs: Moves of both policies in each episode.
+        least: The pair with the smallest ratio that there can be.
     """
     ours, theirs = [a for a, _ in pairs], [b for _, b in pairs]
     return {
         "ratio": sum(ours) / sum(theirs) if pairs else None,
-        "ci95": ratio_interval(ours, theirs, (1, MAX_MOVES), (MAX_MOVES, 1)),
+        "ci95": ratio_interval(ours, theirs, least, (MAX_MOVES, 1)),
         "episodes": len(pairs),
     }
 
@@ -131,7 +132,8 @@ def summarize(
         solvable: The same for the solvable pairs, and the fraction that is revealed within
             `ALLOWED_RATIO` times the moves of the oracle's plan.
         moves: Mean number of moves of the episodes that revealed the target.
-        to_oracle: Ratio to the moves of the oracle's plans, over the revealed solvable pairs.
+        to_oracle: Ratio to the moves of the oracle's plans, over the revealed pairs whose plan has
+            the fewest moves that there can be.
         to_area: Ratio to the moves of the area policy, over the pairs that both reveal.
     """
     pairs = targets.pairs[: len(results)]
@@ -142,11 +144,14 @@ def summarize(
     ]
     efficient = sum(is_revealed(r) and r.moves <= ALLOWED_RATIO * best for r, best in solvable)
     moves = [r.moves for r in results if is_revealed(r)]
-    collapsed = (TerminationReason.COLLAPSED.value, TerminationReason.LEFT_TRAY.value)
     return {
         "episodes": len(results),
         **_rate("revealed", sum(map(is_revealed, results)), len(results)),
-        **_rate("collapsed", sum(r.ended in collapsed for r in results), len(results)),
+        **_rate(
+            "collapsed",
+            sum(TerminationReason(r.ended).is_failed_move for r in results),
+            len(results),
+        ),
         "solvable": {
             "episodes": len(solvable),
             "oracle_moves": float(np.mean([best for _, best in solvable])) if solvable else None,
@@ -155,7 +160,14 @@ def summarize(
         },
         "moves": float(np.mean(moves)) if moves else None,
         "moves_ci95": mean_interval(moves, 1, MAX_MOVES),
-        "to_oracle": moves_ratio([(r.moves, best) for r, best in solvable if is_revealed(r)]),
+        "to_oracle": moves_ratio(
+            [
+                (result.moves, pair.moves)
+                for result, pair in zip(results, pairs, strict=True)
+                if pair.moves is not None and pair.is_optimal and is_revealed(result)
+            ],
+            least=(1, 1),
+        ),
         "to_area": moves_ratio(
             [
                 (ours.moves, theirs.moves)
@@ -210,8 +222,7 @@ def main(
     out: ResultsOption = None,
 ) -> None:
     """Run the episodes that are missing, and print the table."""
-    if fidelity not in FIDELITIES:
-        raise InputError(f"--fidelity {fidelity}; expected {', '.join(FIDELITIES)}")
+    fidelity = check_evaluation(fidelity, out, folder == EPISODES, bool(agents or count))
     names = [name for name in SETS if only is None or only in name]
     if not names:
         raise InputError(f"--only {only}; expected a part of one of {', '.join(SETS)}")
