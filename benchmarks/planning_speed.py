@@ -22,6 +22,7 @@ import typer
 
 from benchmarks.pick_place import OutOption, fraction, quantiles, write_results
 from benchmarks.planning_problems import ProblemsArgument, load_problems
+from drake_clutter.resources import git_commit
 from training.script import ROOT, progress, run_script
 
 PLANNERS = ("unoptimized", "optimized")
@@ -122,7 +123,8 @@ def main(
         for planner, parts in of.items()
     }
     command = f"benchmarks/planning_speed.py {problems.name} --count {count}"
-    write_results(out, {"command": command, "count": len(found), "rows": rows})
+    head = {"command": command, "baseline": git_commit(baseline) if baseline else None}
+    write_results(out, {**head, "count": len(found), "rows": rows})
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ import typer
 
 from benchmarks.pick_place import CONFIG, NODES, MoveSampler, OutOption, quantiles, write_results
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
+from drake_clutter.resources import git_commit
 from drake_clutter.station.arm_executor import ArmExecutor
 from training.script import ROOT, SeedOption, progress, run_script
 
@@ -133,7 +134,8 @@ def main(
     rows = {name: summarize(part) for name, part in results.items()}
     rows["before / after"] = compare(results["before"], results["after"])
     command = f"benchmarks/simulation_speed.py --count {count} --seed {seed}"
-    write_results(out, {"command": command, "seed": seed, "count": count, "rows": rows})
+    head = {"command": command, "baseline": git_commit(baseline)}
+    write_results(out, {**head, "seed": seed, "count": count, "rows": rows})
 
 
 if __name__ == "__main__":

@@ -28,8 +28,11 @@ def resource_path(relative_path: str) -> Path:
     return path
 
 
-def git_commit() -> str:
-    """Return the Git commit of the checkout that contains the package.
+def git_commit(folder: Path | None = None) -> str:
+    """Return the Git commit of the checkout that contains a folder.
+
+    Args:
+        folder: The folder; None for that of this package.
 
     Returns:
         The abbreviated commit, with the suffix "-dirty" if files were modified; "unknown" outside
@@ -37,8 +40,10 @@ def git_commit() -> str:
     """
     results = (":(top,exclude)training/results", ":(top,exclude)benchmarks/results")
     try:
-        commit = _git("describe", "--always")
+        folder = folder or _PACKAGE_DIR
+        commit = _git(folder, "describe", "--always")
         modified_files = _git(
+            folder,
             "--no-optional-locks",
             "status",
             "--porcelain",
@@ -52,12 +57,12 @@ def git_commit() -> str:
     return f"{commit}-dirty" if modified_files else commit
 
 
-def _git(*arguments: str) -> str:
+def _git(folder: Path, *arguments: str) -> str:
     return subprocess.run(
         ["git", *arguments],
         capture_output=True,
         text=True,
         check=True,
-        cwd=_PACKAGE_DIR,
+        cwd=folder,
         timeout=10,
     ).stdout.strip()
