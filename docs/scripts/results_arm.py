@@ -318,7 +318,8 @@ def _speed() -> str:
         "Time of a simulated move",
         f"{results['count']} random moves in scenes of 25 nodes, simulated in turn by an earlier "
         "version whose bellows do not bend and by this one, whose bellows do, on one core; the "
-        "results file names its commit. *Uneventful*: nothing fell, and no object is 5 mm from where it should be. Differences of positions are the largest of "
+        "results file names its commit. *Uneventful*: nothing fell, and no object is 5 mm from "
+        "where it should be. Differences of positions are the largest of "
         "all objects, over moves that are uneventful in both.",
         command=f"python {results['command']} --baseline DIR --out FILE",
         seed=results["seed"],
