@@ -2,9 +2,9 @@
 
     python benchmarks/recording_throughput.py --out recording_throughput.json
 
-Episodes of `SCENES` are recorded without images, and with `CAMERA` at 10 Hz, by 1 to 4 worker
-processes of this machine. The shares of the work are those of the calls in one process. The time
-for more workers is a model, not a measurement:
+The same episodes of `SCENES` are recorded without images, and with `CAMERA` at 10 Hz, by 1 to 4
+worker processes of this machine. The shares of the work are those of the calls in one process.
+The time for more workers is a model, not a measurement:
 
     T(n, w) = start + n * serial + n * work / w
 
@@ -50,6 +50,8 @@ SCENES = "sg_star_25"
 CAMERA = "overhead"
 POLICY = "largest-clear"
 MAX_MOVES = 5
+PROFILED_EPISODES = 10
+"""Number of episodes of which the shares of the work are measured."""
 MODEL_WORKERS = (1, 2, 4, 10, 100, 1000)
 """Numbers of workers for which the model states a time."""
 MODEL_MOVES = 100_000
@@ -152,7 +154,7 @@ def model_row(rate: float, start: float, serial: float, workers: int) -> dict[st
 
 def main(
     out: Annotated[Path, typer.Option(metavar="FILE", help="Results file to write (JSON).")],
-    episodes: Annotated[int, typer.Option(min=2, help="Episodes per worker.")] = 20,
+    episodes: Annotated[int, typer.Option(min=10, help="Number of episodes.")] = 40,
     max_workers: Annotated[int, typer.Option(min=2, help="Largest number of workers.")] = 4,
     seed: SeedOption = 0,
 ) -> None:
@@ -164,11 +166,10 @@ def main(
     models = list[dict[str, Any]]()
     shares = dict[str, dict[str, float]]()
     for images, job in jobs.items():
-        shares[images] = profile(job, episodes)
+        shares[images] = profile(job, min(episodes, PROFILED_EPISODES))
         time_dataset(job, 1, 1)  # compiles and loads what the card needs
-        timings = [
-            time_dataset(job, episodes * workers, workers) for workers in range(1, max_workers + 1)
-        ]
+        small = time_dataset(job, 2, 1)
+        timings = [time_dataset(job, episodes, workers) for workers in range(1, max_workers + 1)]
         for workers, timing in enumerate(timings, start=1):
             rows.append(
                 {
@@ -180,7 +181,8 @@ def main(
                     "finish_s": timing.finish,
                 }
             )
-        serial, rest = np.polyfit([t.moves for t in timings], [t.finish for t in timings], 1)
+        sizes = [small, *timings]
+        serial, rest = np.polyfit([t.moves for t in sizes], [t.finish for t in sizes], 1)
         start = timings[-1].start + rest
         rate = 3600 * timings[0].counted / timings[0].recording
         models += [
@@ -200,7 +202,7 @@ def main(
             "policy": POLICY,
             "max_moves": MAX_MOVES,
             "seed": seed,
-            "episodes_per_worker": episodes,
+            "episodes": episodes,
             "rate_hz": plain.rate,
             "recorded_camera": {"name": CAMERA, "width": 640, "height": 480, "rate_hz": 10},
             "model_moves": MODEL_MOVES,

@@ -28,10 +28,9 @@ def page() -> str:
         f"{results['max_moves']} moves each, {results['rate_hz']:g} samples per second. With "
         f"images: {size} pixels of the camera `{camera['name']}`, {camera['rate_hz']} per second. "
         f"{results['machine']['cpu']}, {results['cores']} cores. *Moves per hour*: carried out by "
-        "all workers, after the first episode of each; "
-        f"{results['episodes_per_worker']} episodes for each worker.",
+        f"all workers, after the first episode of each, of {results['episodes']} episodes.",
         command="python benchmarks/recording_throughput.py "
-        f"--episodes {results['episodes_per_worker']} --out FILE",
+        f"--episodes {results['episodes']} --out FILE",
         seed=str(results["seed"]),
         results=["benchmarks/results/recording_throughput.json"],
     )
