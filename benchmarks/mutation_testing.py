@@ -138,6 +138,15 @@ TESTS = (
     "pick_place_search",
     "side_grasps",
     "trajectory_optimization",
+    "arm_dynamics",
+    "belief",
+    "center_of_mass",
+    "closed_loop",
+    "inverse_reachability",
+    "opposed_faces",
+    "regrip",
+    "target_search",
+    "tilted_camera",
 )
 """Test files that reach these modules in their own process."""
 TESTS_OF_COMPILED_CODE = (

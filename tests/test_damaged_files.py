@@ -56,6 +56,7 @@ from drake_clutter.assets.textured_mesh import gltf_text
 from drake_clutter.catalog import load_catalog
 from drake_clutter.cell.work_cell import load_cell
 from drake_clutter.commands.explore_scene import read_moves
+from drake_clutter.commands.feasibility_job import read_targets
 from drake_clutter.commands.feasibility_parts import PartKind, StudyPart, load_part
 from drake_clutter.commands.generate_scenes import read_generation_progress
 from drake_clutter.commands.inspect_dataset import (
@@ -111,7 +112,9 @@ from drake_clutter.validation import load_config_as, override_config, to_plain
 from drake_clutter.visual_mesh import check_visual_mesh
 from drake_clutter.yaml_io import to_yaml
 from training.evaluate_explorers import EpisodeRecord
+from training.reaching_policy import ReachingPolicy
 from training.results_file import ResultsFile
+from training.target_set import TargetPair, load_target_set, save_target_set
 
 NUM_MUTANTS = int(os.environ.get("DAMAGED_FILES", "100"))
 """Number of mutants of each reader."""
@@ -211,8 +214,9 @@ def damage(path: Path, generator: np.random.Generator) -> None:
         text = data.decode()
         document = mutate_document(json.loads(text), generator)
         if isinstance(document, dict) and "sha256" in document and generator.random() < 0.8:
-            head = {k: v for k, v in document.items() if k not in ("scenes", "sha256")}
-            document["sha256"] = _digest(head, document.get("scenes", []))
+            entries = "pairs" if "pairs" in document else "scenes"
+            head = {k: v for k, v in document.items() if k not in (entries, "sha256")}
+            document["sha256"] = _digest(head, document.get(entries, []))
         many = generator.random() < 0.1
         path.write_text(mutate_json_text(text, generator) if many else json.dumps(document))
     elif structured and path.suffix == ".yaml":
@@ -695,6 +699,37 @@ def robot_files(folder: Path) -> Reader:
     return Reader([Path(spec.model), post], read)
 
 
+def target_set(folder: Path) -> Reader:
+    scenes = load_scene_dataset(DATASET, CATALOG)
+    path = folder / "targets.json"
+    pairs = [
+        TargetPair(scene=0, target="box", solvable="solvable", moves=2, is_optimal=True),
+        TargetPair(scene=1, target="can", solvable="unsolvable", moves=None, is_optimal=False),
+    ]
+    save_target_set(path, {"seed": 3}, scenes, pairs)
+
+    def read() -> None:
+        for pair in load_target_set(path, scenes).pairs:
+            _ = scenes.scenes[pair.scene]
+
+    return Reader([path], read)
+
+
+def target_poses(folder: Path) -> Reader:
+    """Return what reads the file of `feasibility --targets`."""
+    path = folder / "targets.yaml"
+    pose = {"translation": [0.1, 0.0, 0.2], "quaternion": [0.0, 1.0, 0.0, 0.0]}
+    path.write_text(to_yaml([{"name": "up", **pose}, {"name": "down", **pose}]))
+    return Reader([path], lambda: read_targets(path))
+
+
+def reaching_policy(folder: Path) -> Reader:
+    path = folder / "policy.safetensors"
+    metadata = {"kind": "reaching policy", "observation": "state", "num_joints": 6}
+    save_checkpoint(path, ReachingPolicy("state", 6), metadata)
+    return Reader([path, path.with_suffix(".json")], lambda: ReachingPolicy.load(path))
+
+
 READERS = [
     *(mesh_files, visual_files, own_catalog, robot_files),
     *(scene_file, config_file, cell_file, generator_checkpoint, explorer_checkpoint),
@@ -702,7 +737,8 @@ READERS = [
     *(lists_of_options, reachability_map),
     *(soft_q_training, ppo_training, cloning_training),
     *(job_file, progress_file, scene_dataset, image_dataset, record_file, results_file),
-    feasibility_parts,
+    *(feasibility_parts, target_set, target_poses),
+    reaching_policy,
 ]
 
 

@@ -1,5 +1,7 @@
 """Loads that known objects carry: expected values from manual sums of centers of mass."""
 
+from dataclasses import replace
+
 from conftest import resting
 
 from drake_clutter.scenes.scene import SceneObject
@@ -38,6 +40,20 @@ def test_a_hidden_support_carries_only_near_the_center_of_mass() -> None:
     limit = 2 * (0.115 - 0.9 * 0.080)
     assert carries([box], 0, limit - 0.001)
     assert not carries([box], 0, limit + 0.001)
+
+
+def test_a_hidden_support_of_a_box_with_its_center_of_mass_off_the_middle() -> None:
+    """The center of mass lies 20 mm to the side, 60 mm from the next one of the bottom.
+
+    All sides move inwards by 54 mm, which leaves 26 mm on each side of the middle. The common
+    center of mass is halfway between that of the box and that of its load.
+    """
+    box = resting("cracker_box", floor=0.2)
+    off_middle = box.X_TO.rotation.T @ [0.0, 0.020, 0.0]
+    stated = replace(box.object_class, stated_center_of_mass=tuple(off_middle.tolist()))
+    below = [replace(box, object_class=stated)]
+    assert carries(below, 0, 0.0, 2 * 0.026 - 0.020 - 0.001)
+    assert not carries(below, 0, 0.0, 2 * 0.026 - 0.020 + 0.001)
 
 
 def test_what_overhangs_carries_less_on_its_free_side() -> None:

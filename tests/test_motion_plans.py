@@ -295,6 +295,9 @@ def test_a_move_leads_around_an_obstacle() -> None:
         assert distances.min(initial=1.0) > planner.config.min_distance - 0.001
         motion = CubicSpline.from_trajectory(step.trajectory).sample(times)
         assert limits.ratios(motion).values.max() < 1.01
+        ends = q[[0, -1]]
+        assert (q > ends.min(axis=0) - math.pi / 2 - 1e-6).all(), "samples lie near both ends"
+        assert (q < ends.max(axis=0) + math.pi / 2 + 1e-6).all()
     tool = planner.tools["large"]
     q_left, q_right = np.array(first.end.q), np.array(second.end.q)
     for path in (*tool.paths_between(q_left, q_right), *tool.paths_between(q_right, q_left)):

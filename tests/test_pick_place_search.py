@@ -1,6 +1,7 @@
 """Candidates of a move, their loads, and the distances that are allowed at its endpoints."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from conftest import DEFAULT_CELL, ONE_CUP, cell_with, resting
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from drake_clutter.cell.gripper import Payload
 from drake_clutter.cell.support_sdf import FLOOR
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.grammar import Orientation
@@ -153,3 +155,23 @@ def test_optimization_keeps_2_mm_more_from_columns_than_required() -> None:
     distances = columns.distances(path[-1:])
     assert distances.slack.min() == pytest.approx(0.01 - 0.002, abs=1e-5)
     assert columns.slack(path[-1:]) == pytest.approx(0.01, abs=2e-4)
+
+
+def test_a_segment_that_cannot_be_made_faster_is_kept() -> None:
+    planner, search = search_of([UPPER], "upper")
+    grasps = planner.grasps(UPPER)
+    assert not isinstance(grasps, PlanningFailure)
+    candidate = next(search.ik_candidates(grasps[0]))
+    pick = search._pick_endpoint(candidate)
+    place = search._place_endpoint(candidate, candidate.q_place)
+    assert pick is not None
+    assert place is not None
+    endpoints = pick, place
+    found = search.plan_candidate(candidate)
+    assert found is not None
+    segment = found.segments["retreat"]
+    faster = search._segments._optimize_segment(segment, Payload(), candidate, endpoints)
+    assert faster.duration < segment.duration
+    shortest = replace(segment, unoptimized_duration=0.9 * faster.duration)
+    kept = search._segments._optimize_segment(shortest, Payload(), candidate, endpoints)
+    assert kept is shortest

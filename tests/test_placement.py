@@ -13,9 +13,12 @@ from drake_clutter.grammar import Orientation
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.scenes.free_space import (
     CELL_SIZE,
+    Footprint,
+    best_fits,
     is_observed_free,
     levels_above,
     next_free_cell,
+    visible_top_cells,
 )
 from drake_clutter.scenes.geometry import penetration_depth
 from drake_clutter.scenes.interfaces import Move, Observation
@@ -365,6 +368,58 @@ def test_only_points_in_the_image_are_seen_to_be_free() -> None:
         rows, state = np.zeros((1, 3), np.int64), np.zeros((1, 1), np.int8)
         found = next_free_cell(depth, camera.pinhole, *grid, rows, cell, 0, state)
         assert found == (0 if is_in_image else 1)
+
+
+def test_a_top_is_seen_up_to_the_border_of_the_image() -> None:
+    camera = DEFAULT_CELL.camera
+    depth = np.full((camera.height, camera.width), 0.5, np.float32)
+    mask = np.full(depth.shape, True)
+    outline = 0.001 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    pixels, expected = pixels_at_the_border()
+    p_T = camera.backproject(pixels, np.full(len(pixels), 0.5))
+    for p, is_in_image in zip(p_T, expected, strict=True):
+        view = (depth, mask, camera.pinhole, p[:1], p[1:2], p[2], p[:2], outline)
+        assert len(visible_top_cells(*view)) == is_in_image
+
+
+def scores_of_fits(
+    free: NDArray[np.bool_], footprint: Footprint, distance: NDArray[np.floating], weight: float
+) -> dict[tuple[int, int], float]:
+    """Return the scores of all cells at which a footprint fits, cell by cell."""
+    n, m = free.shape
+    taken = np.ones((3 * n, 3 * m), np.bool_)
+    taken[n : 2 * n, m : 2 * m] = ~free
+
+    def cells(part: NDArray[np.int64]) -> NDArray[np.int64]:
+        return np.array([(k, c) for k, first, last in part for c in range(first, last + 1)])
+
+    inside, border = (cells(part) for part in footprint)
+    found = dict[tuple[int, int], float]()
+    for i, j in np.ndindex(n, m):
+        at = np.array([n + i, m + j])
+        if not taken[tuple((inside + at).T)].any():
+            touching = np.count_nonzero(taken[tuple((border + at).T)])
+            share = touching / (len(border) - len(inside))
+            found[i, j] = share + weight * float(distance[i, j])
+    return found
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_best_fits_are_those_of_a_search_over_all_cells(seed: int) -> None:
+    """Cells are taken at random, and the footprint is not symmetric."""
+    rows = np.array([[-1, -1, 2], [1, 0, 1], [0, -2, 2]])
+    border = np.array([[-2, -2, 3], [2, -1, 2], [-1, -3, 3], [1, -2, 3], [0, -3, 3]])
+    footprint = Footprint(rows, border)
+    free = rng(seed).random((12, 15)) < 0.95
+    distance = 0.1 * rng(seed).integers(0, 3, free.shape)
+    for weight in (0.0, 0.5):
+        scores = scores_of_fits(free, footprint, distance, weight)
+        cells, score = best_fits(free, rows, border, distance, weight, -np.inf)
+        highest = max(scores.values())
+        assert score == pytest.approx(highest)
+        best = [cell for cell, value in scores.items() if value > highest - 1e-9]
+        assert cells.tolist() == [[*cell] for cell in best]
+        assert len(best_fits(free, rows, border, distance, weight, score)[0]) == 0
 
 
 def test_the_space_of_an_object_is_seen_through_every_20_mm() -> None:

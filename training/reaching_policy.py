@@ -4,12 +4,15 @@ Frames: T is the support, G is the tool, z out of it, O is the picked object.
 """
 
 from pathlib import Path
+from typing import Annotated, Literal
 
 import torch
+from pydantic import BaseModel
 from torch import Tensor, nn
 
 from drake_clutter.files import InputError
-from drake_clutter.learning.checkpoint import load_checkpoint
+from drake_clutter.learning.checkpoint import load_checkpoint, load_weights
+from drake_clutter.validation import InRange, validate
 from training.reaching_demonstrations import NEIGHBORHOOD
 
 CHECKPOINT_KIND = "reaching policy"
@@ -99,13 +102,23 @@ class ReachingPolicy(nn.Module):
 
     @staticmethod
     def load(path: Path) -> "ReachingPolicy":
-        """Read a checkpoint."""
+        """Read a checkpoint.
+
+        Raises:
+            InputError: The file cannot be read, or is not a policy's checkpoint.
+        """
         checkpoint = load_checkpoint(path)
         if checkpoint.kind != CHECKPOINT_KIND:
             raise InputError(f"{path}: kind: {checkpoint.kind}; expected {CHECKPOINT_KIND}")
-        policy = ReachingPolicy(
-            str(checkpoint.metadata["observation"]), int(checkpoint.metadata["num_joints"])
-        )
-        policy.load_state_dict(checkpoint.weights)
-        policy.eval()
-        return policy
+        source = str(path.with_suffix(".json"))
+        metadata = validate(_PolicyMetadata, checkpoint.metadata, source)
+        policy = ReachingPolicy(metadata.observation, metadata.num_joints)
+        load_weights(policy, checkpoint.weights, path)
+        return policy.eval()
+
+
+class _PolicyMetadata(BaseModel):
+    """What a policy needs of the metadata of its checkpoint."""
+
+    observation: Literal["state", "depth"]
+    num_joints: Annotated[int, InRange(2, 20)]

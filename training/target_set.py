@@ -107,13 +107,18 @@ def load_target_set(path: Path, scenes: SceneDataset) -> TargetSet:
         entries = document.pop("pairs")
         digest = document.pop("sha256")
         scenes_digest = document["scenes_sha256"]
+        name = str(document["scenes"])
         was_changed = _digest(document, entries) != digest
     if was_changed:
         raise InputError(f"{path}: sha256: does not match the pairs; expected an unmodified file")
     if scenes_digest != scenes.sha256:
         raise InputError(
             f"{path}: scenes_sha256: is that of other scenes than {scenes.name}; expected the"
-            f" dataset {document['scenes']} for which the pairs were drawn"
+            f" dataset {name} for which the pairs were drawn"
         )
     pairs = validate(tuple[TargetPair, ...], entries, f"{path}: pairs")
-    return TargetSet(path.name, document["scenes"], pairs, digest)
+    for number, pair in enumerate(pairs):
+        if pair.scene >= len(scenes.scenes):
+            allowed = f"0 to {len(scenes.scenes) - 1}"
+            raise InputError(f"{path}: pairs.{number}.scene: {pair.scene}; expected {allowed}")
+    return TargetSet(path.name, name, pairs, digest)
