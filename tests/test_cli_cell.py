@@ -32,11 +32,14 @@ def scene_file(tmp_path: Path) -> Path:
     return path
 
 
-def run(*arguments: str | Path) -> None:
+def run(*arguments: str | Path, code: int = 0) -> str:
+    """Run a command, check its exit code and return what it prints."""
+| Path) -> None:
     result = CliRunner().invoke(app, [str(argument) for argument in arguments])
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
-    assert result.exit_code == 0, result.output
+    assert result.exit_code == code, result.output
+    return result.output
 
 
 def test_a_move_uses_and_stores_the_cell_of_the_scene(scene_file: Path, tmp_path: Path) -> None:
@@ -222,7 +225,8 @@ def test_plans_alone_from_the_command_line(tmp_path: Path) -> None:
     moves = tmp_path / "moves.yaml"
     moves.write_text("[{pick: gelatin_box, place: tray}, {pick: large_marker, place: tray}]")
     options = ("--fidelity", "arm", "--plan-only", "--out", tmp_path / "plans")
-    run("move", tmp_path / "scene.yaml", "--moves", moves, *options)
+    output = run("move", tmp_path / "scene.yaml", "--moves", moves, *options, code=1)
+    assert "no plan: no seal: large_marker" in output
     planned, failed = json.loads((tmp_path / "plans" / "plan.json").read_text())["plans"]
     assert planned["planned"]
     assert [segment["name"] for segment in planned["segments"]] == ["approach", "carry", "retreat"]

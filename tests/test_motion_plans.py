@@ -278,14 +278,15 @@ def test_a_move_leads_around_an_obstacle() -> None:
     wall = Fixture(name="wall", pose=PoseSpec(translation=(-0.1, 0.0, 0.4)), box=(0.4, 0.03, 0.78))
     cell = DEFAULT_CELL.model_copy(update={"fixtures": (wall,)})
     planner = PickPlacePlanner(cell, PlannerConfig())
-    state = planner.home_state([CAN])
+    can = replace(CAN, X_TO=CAN.X_TO.translated((0.0, 0.2, 0.0)))
+    state = planner.home_state([can])
     left = RigidTransform(TOP.rotation(), [-0.1, 0.25, 0.2])
     right = RigidTransform(TOP.rotation(), [-0.1, -0.25, 0.2])
     # Where the arm would stop without the wall; with it, other branches are free of it.
-    stop = planned(PLANNER.plan_move(PLANNER.home_state([CAN]), left)).end
+    stop = planned(PLANNER.plan_move(state, left)).end
     first = planned(planner.plan_move(state, stop.q))
     second = planned(planner.plan_move(first.end, planned(PLANNER.plan_move(stop, right)).end.q))
-    model = planner.collision_model([CAN])
+    model = planner.collision_model([can])
     limits = MotionLimits(cell, Payload())
     for plan in (first, second):
         (step,) = plan.steps

@@ -1,5 +1,7 @@
 """Parallel jaws: grasps on two opposed faces, loads, and a simulated pick-and-place by friction."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from conftest import CLASSES, resting, scene_of
@@ -8,13 +10,14 @@ from drake_clutter.cell.gripper import GraspFailure, GraspFailureReason, GraspSa
 from drake_clutter.cell.parallel_jaw import JAWS, ParallelJawGripper
 from drake_clutter.cell.work_cell import WorkCell, load_cell
 from drake_clutter.grammar import Orientation
+from drake_clutter.planning.motion_plan import HeldObject
 from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.simulation.scene_plant import rigid_transform
-from drake_clutter.station.station_simulation import StationSimulation
+from drake_clutter.station.station_simulation import StationSimulation, execute_grips
 
 GRIPPER = ParallelJawGripper(kind="parallel_jaw")
 SAMPLING = GraspSampling(spacing=0.012, lip_gap=0.0005, max_grasps=9, min_payload_acceleration=0.3)
@@ -111,3 +114,29 @@ def test_jaws_without_an_object_are_open(cell: WorkCell) -> None:
     plan = planner.plan_move(planner.home_state([]), q.tolist())
     assert not isinstance(plan, PlanningFailure)
     assert {step.joints for step in plan.steps} == {(0.0, 0.0)}
+
+
+def test_jaws_that_close_on_nothing_go_back_and_try_another_grasp(cell: WorkCell) -> None:
+    """The can is 0.15 m beside its believed pose; each of two grasps closes beyond its surface."""
+    believed, true = (resting("tomato_soup_can", xy=(x, 0.0)) for x in (0.1, -0.05))
+    planner = PickPlacePlanner(cell, PlannerConfig(optimize=False))
+
+    def plan(exclude: Sequence[HeldObject] = ()) -> PickPlacePlan | PlanningFailure:
+        X_TO_place = believed.X_TO.translated((0.0, -0.2, 0.001))
+        return planner.plan([believed], believed.name, X_TO_place, exclude=exclude)
+
+    first = plan()
+    assert isinstance(first, PickPlacePlan)
+    simulation = StationSimulation(cell, scene_of(true))
+    result = execute_grips(simulation, first, plan, max_grips=2)
+    assert (result.grasped, result.missed_grasp, result.num_grips) == (False, True, 2)
+    assert isinstance(result.plan, PickPlacePlan)
+    turn = first.X_OG.rotation().InvertAndCompose(result.plan.X_OG.rotation())
+    assert turn.ToAngleAxis().angle() > 0.1, "in another direction"
+    assert result.poses[true.name].p == pytest.approx(true.X_TO.p, abs=0.0005)
+    q = simulation.station.joint_positions(simulation.plant_context)
+    assert q == pytest.approx(np.array(cell.robot.home), abs=0.001)
+    jaws = simulation.station.GetOutputPort("gripper_state").Eval(
+        simulation.station.GetMyContextFromRoot(simulation.root)
+    )
+    assert jaws[:2] == pytest.approx([0.0, 0.0], abs=0.001), "opened"

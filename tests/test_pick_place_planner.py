@@ -194,10 +194,10 @@ def test_poses_may_be_out_of_reach() -> None:
 def test_neighbors_may_block_every_grasp() -> None:
     """The body of the gripper does not fit between two high boxes."""
     low = resting("gelatin_box", Orientation.UPRIGHT_0, name="low")
-    places = [(x, z) for x in (0.06, -0.06) for z in (0.0, 0.23)]
+    places = [(y, z) for y in (0.048, -0.048) for z in (0.0, 0.23)]
     walls = [
-        resting("cracker_box", Orientation.UPRIGHT_0, (x, 0.0), z, f"wall_{k}")
-        for k, (x, z) in enumerate(places)
+        resting("cracker_box", Orientation.UPRIGHT_0, (0.0, y), z, f"wall_{k}")
+        for k, (y, z) in enumerate(places)
     ]
     found = planner().plan([low, *walls], "low", place_pose(low, 0.2, -0.2))
     assert reason(found) is PlanningFailureReason.IN_COLLISION
@@ -221,11 +221,11 @@ def test_moves_with_reachable_endpoints_are_planned() -> None:
     here = planner(config=PlannerConfig(optimize=False))
     for seed in range(3):
         scene = random_scene(seed, 12, 12)
-        tower = resting("cracker_box", Orientation.UPRIGHT_0, (-0.28, 0.0), name="tower")
+        tower = resting("cracker_box", Orientation.UPRIGHT_90, (-0.315, 0.0), name="tower")
         objects = [*scene.objects, tower]
         for k, o in enumerate(scene.objects):
             x, y = generator.uniform(-0.25, 0.25, 2)
-            x, y, floor = (-0.28, 0.0, tower.top_height) if k % 4 == 0 else (x, y, 0.0)
+            x, y, floor = (-0.315, 0.0, tower.top_height) if k % 4 == 0 else (x, y, 0.0)
             height = float(o.X_TO.p[2] - o.bounds_T[0][2])
             place = Pose((x, y, floor + height + 0.001), o.X_TO.quaternion)
             if here.are_endpoints_reachable(objects, o.name, place):
@@ -312,3 +312,41 @@ def test_results_files_with_earlier_names_load() -> None:
     written = to_plain(PlannerConfig(optimize=False))
     assert not {"clearance", "rise", "above", "optimise"} & written.keys()
     assert validate(PlannerConfig, written, "") == PlannerConfig(optimize=False)
+
+
+@pytest.mark.parametrize(
+    ("xy", "floor", "pair", "depth"),
+    [
+        ((0.075, 0.0), 0.0, "pudding_box and can", 0.013),
+        ((0.2, 0.2), -0.037, "can and floor", 0.037),
+        ((0.088, 0.0), 0.0, "", 0.0),
+    ],
+    ids=["in a box", "in the floor", "touching"],
+)
+def test_objects_that_overlap_at_the_start_are_refused(
+    xy: tuple[float, float], floor: float, pair: str, depth: float
+) -> None:
+    """The can has a radius of 33 mm, the box extends 55 mm along x from its center."""
+    box = resting("pudding_box")
+    bystander = resting("gelatin_box", xy=(-0.2, -0.2))
+    can = resting("tomato_soup_can", Orientation.UPRIGHT_0, xy, floor, "can")
+    objects = [box, can, bystander]
+    here = planner()
+    found = here.plan(objects, bystander.name, place_pose(bystander, -0.2, 0.2))
+    moved = here.plan_move(here.home_state(objects), here.robot.home)
+    is_reachable = here.are_endpoints_reachable(
+        objects, bystander.name, place_pose(bystander, -0.2, 0.2)
+    )
+    if not pair:
+        assert isinstance(found, PickPlacePlan)
+        assert is_reachable
+        return
+    for failure in (found, moved):
+        assert isinstance(failure, PlanningFailure)
+        assert failure.reason is PlanningFailureReason.OBJECTS_OVERLAP
+        assert failure.detail == pair
+        assert failure.value == pytest.approx(depth, abs=1e-4)
+    assert not is_reachable
+    estimated = planner(config=PlannerConfig(max_overlap=depth + 0.001, optimize=False))
+    found = estimated.plan(objects, bystander.name, place_pose(bystander, -0.2, 0.2))
+    assert isinstance(found, PickPlacePlan)

@@ -161,7 +161,7 @@ def test_plans_to_poses_are_exported_from_the_command_line(tmp_path: Path) -> No
     arguments += ["--fidelity", "arm", "--plan-only", "--export", "csv", "--export", "urscript"]
     out = tmp_path / "out"
     result = CliRunner().invoke(app, [*arguments, "--rate", "125", "--out", str(out)])
-    assert result.exit_code == 0, result.output
+    assert result.exit_code == 1, result.output
     assert {path.name for path in out.iterdir()} >= {"plan_1.csv", "plan_1.script", "plan.json"}
     assert not (out / "plan_2.csv").exists()
     planned, refused = json.loads((out / "plan.json").read_text())["plans"]

@@ -12,6 +12,14 @@ PROGRAM = "drake-clutter"
 _FACTS = re.compile(r"\s*\[([^\[\]]*)\]$")
 """End of a parameter's help, where Typer puts default, range and whether it is required."""
 
+EXIT_CODES = [
+    ["0", "done; what a search, an evaluation or a study finds does not change the exit code"],
+    ["1", "`doctor`, `inspect`: a check failed; `move`: a move has no plan or is not carried out"],
+    ["2", "a mistake in an option or a file, or a file cannot be written"],
+    ["130", "interrupted"],
+]
+"""Exit codes of all commands, with their meaning."""
+
 
 def page() -> str:
     """Return the page."""
@@ -26,7 +34,9 @@ def page() -> str:
         "# Command line\n\n"
         f"`{PROGRAM}` is installed with the package. Every command has `--help`. A mistake in an "
         "option or a file is one line on standard error that names the field and the allowed "
-        "values; the exit code is then 2.\n\n"
+        "values.\n\n"
+        + table(["exit code", "meaning"], EXIT_CODES)
+        + "\n"
         + table(["command", "purpose"], overview)
         + "".join(_section(name, command, context) for name, command, context in commands)
     )

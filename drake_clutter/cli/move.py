@@ -20,7 +20,7 @@ from drake_clutter.cli.options import (
     SeedOption,
     SetOption,
 )
-from drake_clutter.cli.output import print_episode, print_result, print_transition
+from drake_clutter.cli.output import print_result, print_transition
 from drake_clutter.files import InputError
 
 
@@ -78,7 +78,8 @@ def move(
 ) -> None:
     """Execute one move or a list of moves in a scene.
 
-    Writes `episode.json`, the final scene `after.yaml` and the web page `index.html`.
+    Writes `episode.json`, the final scene `after.yaml` and the web page `index.html`. Exits with
+    code 1 if a move has no plan or is not carried out.
     """
     from drake_clutter.commands.explore_scene import (
         DEFAULT_EXPORT_RATE,
@@ -91,8 +92,12 @@ def move(
         write_episode,
     )
     from drake_clutter.commands.job_file import open_job_folder, read_result, scene_job
-    from drake_clutter.reports.terminal_text import describe_plans
-    from drake_clutter.scenes.interfaces import Move
+    from drake_clutter.reports.terminal_text import (
+        describe_episode,
+        describe_outcomes,
+        describe_plans,
+    )
+    from drake_clutter.scenes.interfaces import Move, MoveResult
 
     if (moves is None) == (pick is None) or (pick is None) != (place is None):
         raise InputError("move: expected either --pick NAME --place NAME, or --moves FILE")
@@ -132,5 +137,10 @@ def move(
     if plan_only:
         plans = result["plans"]
         print_result({"plans": plans}, describe_plans(plans), as_json, f"{out}")
+        num_done = sum(plan["planned"] for plan in plans)
     else:
-        print_episode(result, as_json, out)
+        rows = describe_episode(result) | describe_outcomes(result)
+        print_result(result, rows | {"page": str(out / "index.html")}, as_json, f"{out}")
+        num_done = sum(MoveResult(step["outcome"]).is_at_placement for step in result["moves"])
+    if num_done < len(requested):
+        raise typer.Exit(1)

@@ -16,7 +16,7 @@ from drake_clutter.config import ClutterConfig
 from drake_clutter.feasibility.move_study import PLANNED, MoveRecord
 from drake_clutter.planning.pick_place_plan import PlanningFailure
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
-from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.planning.planner_config import ANY_OVERLAP, PlannerConfig
 from drake_clutter.scenes.interfaces import MoveResult
 from drake_clutter.scenes.scene import Pose, Scene, SceneObject
 from drake_clutter.seeding import item_rng
@@ -115,7 +115,7 @@ class NoiseStudy:
         planned = [k for k, record in enumerate(records) if record.result == PLANNED]
         order = item_rng(self._seed, index, 0).permutation(len(planned))[:count]
         cell = self._config.cell.with_support(scene.support)
-        planner = PickPlacePlanner(cell, PlannerConfig())
+        planner = PickPlacePlanner(cell, PlannerConfig(max_overlap=ANY_OVERLAP))
         return [
             self._simulate(planner, name, scene, records[k], kind, size, (index, 1, k, row))
             for k in sorted(planned[i] for i in order.tolist())

@@ -186,13 +186,14 @@ class CollisionModel:
             ]
             for name, body in self._bodies.items()
         }
-        self.fixed_corners = tuple(
-            query.GetPoseInWorld(self._geometry_ids[shape]).multiply(corners.T).T
+        hulls = {
+            shape: query.GetPoseInWorld(self._geometry_ids[shape]).multiply(corners.T).T
             for body in self._fixed
             for shape in shapes_of(body)
             if not self._shape_names[shape].startswith(_OCCLUDED_PREFIX)
             and len(corners := hull_corners(inspector, self._geometry_ids[shape]))
-        )
+        }
+        self.fixed_corners = tuple(hulls.values())
         obstacles = (*self._fixed, *self._bodies.values())
         self._obstacle_shapes = [shape for body in obstacles for shape in shapes_of(body)]
         self._solid_shapes = [
@@ -200,6 +201,15 @@ class CollisionModel:
             for shape in self._obstacle_shapes
             if not self._shape_names[shape].startswith(_OCCLUDED_PREFIX)
         ]
+        everywhere = np.full(3, np.inf)
+        self._fixed_bounds = {
+            shape: (hulls[shape].min(axis=0), hulls[shape].max(axis=0))
+            if shape in hulls
+            else (-everywhere, everywhere)
+            for body in self._fixed
+            for shape in shapes_of(body)
+            if not self._shape_names[shape].startswith(_OCCLUDED_PREFIX)
+        }
         self._gripper_shapes = [
             shape
             for body in self._arm.bodies
@@ -433,6 +443,37 @@ class CollisionModel:
         q = np.zeros((1, len(self._q_indices)))
         found = self._find_distances(q, max_distance, pairs)
         return [self.signed_distance(found, k) for k in range(len(found.rows))]
+
+    def deepest_overlap(
+        self, objects: Sequence[SceneObject], min_depth: float
+    ) -> SignedDistance | None:
+        """Return the deepest overlap of objects with solids; None if none is deep enough.
+
+        Solids are the other objects and what is fixed, without occluded volumes. The bounding boxes
+        of solids that overlap by some depth do so along every axis, unlike those of most solids
+        that touch.
+
+        Args:
+            objects: Objects at the poses of the model.
+            min_depth: Depth above which an overlap counts, not negative [m].
+        """
+        bounds = [*(o.bounds_T for o in objects), *self._fixed_bounds.values()]
+        lower, upper = np.array(bounds).swapaxes(0, 1)
+        first = slice(len(objects))
+        common = np.minimum(upper[first, None], upper) - np.maximum(lower[first, None], lower)
+        shapes = [[shape for shape, _ in self._object_shapes[o.name]] for o in objects]
+        shapes += [[shape] for shape in self._fixed_bounds]
+        pairs = [
+            (shape, other)
+            for i, k in np.argwhere(np.triu((common > min_depth).all(axis=2), 1)).tolist()
+            for shape in shapes[i]
+            for other in shapes[k]
+        ]
+        q = np.zeros((1, len(self._q_indices)))
+        found = self._find_distances(q, 0.0, np.array(pairs, np.int64).reshape(-1, 2))
+        overlaps = [self.signed_distance(found, k) for k in range(len(found.rows))]
+        deepest = min(overlaps, key=lambda overlap: overlap.distance, default=SignedDistance(0.0))
+        return deepest if deepest.distance < -min_depth else None
 
     @property
     def _active_pairs(self) -> NDArray[np.int64]:

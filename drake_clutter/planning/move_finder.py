@@ -27,6 +27,7 @@ from drake_clutter.planning.state_check import (
     check_configuration,
     check_joint_limits,
     check_names,
+    check_overlaps,
     to_configuration,
 )
 from drake_clutter.planning.tool_kinematics import ToolKinematics
@@ -114,6 +115,9 @@ class MoveFinder:
             excluded: Grasps that are left out.
         """
         start_time = time.perf_counter()
+        model = self.collision_model(state.objects, occluded)
+        if failure := check_overlaps(model, state.objects, self.config.max_overlap):
+            return failure
         if carried := objects_resting_on(goal.picked, state.objects):
             return PlanningFailure(PlanningFailureReason.CARRIES_OTHERS, ", ".join(carried))
         if grasp is None:
@@ -128,7 +132,6 @@ class MoveFinder:
             if isinstance(verified, PlanningFailure):
                 return verified
             candidates = [verified]
-        model = self.collision_model(state.objects, occluded)
         failure = self._check_endpoints(state, goal, model)
         if failure is not None:
             return failure
@@ -176,6 +179,9 @@ class MoveFinder:
         held = state.held
         assert held is not None
         model = self.collision_model(state.objects, occluded)
+        others = [o for o in state.objects if o.name != held.name]
+        if failure := check_overlaps(model, others, self.config.max_overlap):
+            return failure
         if failure := self._check_endpoints(state, goal, model):
             return failure
         X_TG = RigidTransform(self.tools[held.tool].pose(np.array(state.q)))
@@ -231,6 +237,8 @@ class MoveFinder:
         if failure := self._check_start(state):
             return failure
         model = self.collision_model(state.objects, occluded)
+        if failure := check_overlaps(model, state.objects, self.config.max_overlap):
+            return failure
         if failure := check_configuration(
             self.robot, self.config.min_distance, model, np.array(state.q), "at the start"
         ):

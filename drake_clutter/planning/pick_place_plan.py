@@ -42,6 +42,7 @@ class PlanningFailureReason(Enum):
     NO_GRASP_LEFT = "no grasp left"
     TOO_HEAVY = "too heavy"
     CARRIES_OTHERS = "carries others"
+    OBJECTS_OVERLAP = "objects overlap"
     PLACE_IN_COLLISION = "place in collision"
     PLACE_TILTED = "place tilted"
     PLACE_UNSUPPORTED = "place without support"
@@ -60,6 +61,7 @@ _UNITS = {
     PlanningFailureReason.NO_OPPOSED_FACES: (1000.0, "mm"),
     PlanningFailureReason.NO_GRASP_LEFT: (1.0, "excluded"),
     PlanningFailureReason.TOO_HEAVY: (1.0, "kg"),
+    PlanningFailureReason.OBJECTS_OVERLAP: (1000.0, "mm"),
     PlanningFailureReason.PLACE_IN_COLLISION: (1000.0, "mm"),
     PlanningFailureReason.PLACE_TILTED: (math.degrees(1.0), "deg"),
     PlanningFailureReason.PLACE_UNSUPPORTED: (1000.0, "mm"),
@@ -82,10 +84,10 @@ class PlanningFailure:
             out of reach.
         value: Quantity that the reason refers to: flatness deviation of the surface under the best
             grasp [m], mass [kg], signed distance [m], tilt [rad] or time [s]; number of excluded
-            grasps if none is left; of a place pose the depth of penetration [m], the tilt [rad],
-            the gap to what is below [m] or the distance of the center of mass from the contact
-            area [m]; of a configuration the excess of a joint [rad]; of a weak grasp the
-            acceleration that it bears [m/s^2]. NaN if there is none.
+            grasps if none is left; depth of the deepest overlap [m]; of a place pose the depth of
+            penetration [m], the tilt [rad], the gap to what is below [m] or the distance of the
+            center of mass from the contact area [m]; of a configuration the excess of a joint
+            [rad]; of a weak grasp the acceleration that it bears [m/s^2]. NaN if there is none.
         planning_time: Wall time spent [s].
     """
 
@@ -96,6 +98,11 @@ class PlanningFailure:
 
     def __str__(self) -> str:
         return f"{self.reason.value}{f': {self.detail}' if self.detail else ''}"
+
+    @property
+    def description(self) -> str:
+        """Reason and detail, with the quantity if there is one."""
+        return f"{self} ({self.quantity})" if self.quantity else str(self)
 
     @property
     def quantity(self) -> str:

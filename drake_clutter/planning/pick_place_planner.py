@@ -36,6 +36,7 @@ from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.state_check import (
     check_held,
     check_joint_limits,
+    check_overlaps,
     check_pose,
     check_positive,
     find_object,
@@ -387,6 +388,8 @@ class PickPlacePlanner:
         if objects_resting_on(picked, objects):
             return False
         model = self.collision_model(objects)
+        if check_overlaps(model, objects, self.config.max_overlap) is not None:
+            return False
         max_drop = self.config.max_guarded_descent
         if self._finder.check_release(model, objects, picked, X_TO_place, max_drop) is not None:
             return False

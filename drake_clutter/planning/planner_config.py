@@ -10,6 +10,10 @@ from drake_clutter.validation import (
     renamed_fields,
 )
 
+ANY_OVERLAP = 1.0
+"""Value of `PlannerConfig.max_overlap` for estimated poses [m]: objects overlap by less, even if
+the class of one is wrong."""
+
 
 @config_class
 @renamed_fields(
@@ -47,6 +51,8 @@ class PlannerConfig:
             until contact is detected [m]. 0 disables the guarded descent.
         descent_start_offset: Height above the place pose at which the guarded descent starts [m].
             If the arm cannot descend by this much, the object is released at the place pose.
+        max_overlap: Largest depth to which known objects may overlap each other or what is fixed
+            [m]. Estimated poses need more, see `ANY_OVERLAP`.
         carry_clearance: Errors for which a carried object keeps a larger distance.
         optimize: Whether trajectory optimization shortens the duration of a plan.
     """
@@ -63,5 +69,6 @@ class PlannerConfig:
     max_grips: Count = 3
     max_guarded_descent: NonNegative = 0.0
     descent_start_offset: NonNegative = 0.0
+    max_overlap: NonNegative = 0.0005
     carry_clearance: CarryClearance = CarryClearance()
     optimize: Flag = True

@@ -108,6 +108,23 @@ def check_configuration(
     return PlanningFailure(reason, f"{name}: {pair}", nearest.distance)
 
 
+def check_overlaps(
+    model: CollisionModel, objects: Sequence[SceneObject], max_overlap: float
+) -> PlanningFailure | None:
+    """Return the solids that overlap most, if too deep.
+
+    Args:
+        model: Collision model with the objects at their poses.
+        objects: Objects that are not held.
+        max_overlap: Largest allowed depth [m].
+    """
+    deepest = model.deepest_overlap(objects, max_overlap)
+    if deepest is None:
+        return None
+    pair = " and ".join(deepest.pair)
+    return PlanningFailure(PlanningFailureReason.OBJECTS_OVERLAP, pair, -deepest.distance)
+
+
 def check_held(state: CellState, *, is_held: bool) -> HeldObject:
     """Return the held object.
 

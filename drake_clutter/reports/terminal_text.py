@@ -103,6 +103,16 @@ def describe_episode(episode: Mapping[str, Any]) -> dict[str, str]:
     return rows
 
 
+def describe_outcomes(episode: Mapping[str, Any]) -> dict[str, str]:
+    """Return the outcomes of the moves of an `episode.json` as texts by number of the move."""
+    rows = {}
+    for number, step in enumerate(episode["moves"], start=1):
+        reasons = "; ".join(filter(None, (step["instability"], step["detail"])))
+        outcome = f"{step['outcome']}{f' ({reasons})' if reasons else ''}"
+        rows[f"move {number}"] = f"{step['move']['pick']} to {step['move']['place']}: {outcome}"
+    return rows
+
+
 def describe_solution(solution: Mapping[str, Any]) -> dict[str, str]:
     """Return a `solution.json` as texts by label."""
     rows = {"result": str(solution["solvability"])}

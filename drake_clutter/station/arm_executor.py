@@ -91,7 +91,7 @@ class ArmExecutor:
             return Outcome(
                 MoveResult.NOT_PLANNED,
                 scene,
-                detail=str(plan),
+                detail=plan.description,
                 failure_reason=plan.reason.value,
             )
         result = simulate_plan(
@@ -109,7 +109,7 @@ class ArmExecutor:
         X_TO_place = result.plan.X_TO_place.translated((0.0, 0.0, -result.lowered_distance))
         after = scene.with_poses(result.poses)
         pick, settle = command.move.pick, self._config.settle
-        if result.has_no_seal:
+        if result.missed_grasp:
             outcome = evaluate_no_grasp(scene, after, pick, settle)
         else:
             outcome = evaluate_outcome(

@@ -85,7 +85,8 @@ class ExecutorStatus(Message):
     Attributes:
         number: Number of the plan.
         stage: Stage of the plan, see `CommandSchedule.stage_at`; "idle" if none is executed.
-        has_no_seal: Whether no vacuum has built up at the grasp of the plan.
+        missed_grasp: Whether the gripper has not grasped the object: no vacuum has built up, or the
+            jaws met nothing.
         bellows_extension: Extension of the bellows before the guarded descent [m]; NaN without one.
         felt_mass: Mass that stretched the bellows [kg]; NaN without a guarded descent, or if
             nothing hung on them.
@@ -93,7 +94,7 @@ class ExecutorStatus(Message):
     """
 
     stage: str = "idle"
-    has_no_seal: bool = False
+    missed_grasp: bool = False
     bellows_extension: float = math.nan
     felt_mass: float = math.nan
     has_touched: bool = False

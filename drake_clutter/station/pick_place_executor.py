@@ -42,6 +42,10 @@ MIN_BELLOWS_EXTENSION = 0.0002
 """Extension of the bellows below which they carry no object, or one that is already supported [m].
 The lightest box extends them by 0.5 mm."""
 
+MIN_JAW_SQUEEZE = 0.0005
+"""Distance to the commanded position below which a jaw has not met an object [m]: the command is
+`JAW_SQUEEZE` beyond its surface, and the 2F-85 resolves 0.3 mm (85 mm in 255 steps)."""
+
 
 @dataclass(frozen=True)
 class ExecutorState(Message):
@@ -58,7 +62,7 @@ class ExecutorState(Message):
             without contact.
         waited: Time for which the arm has waited for the vacuum, beyond the planned dwells [s].
         grip_wait: The part of it at the current grasp [s].
-        has_no_seal: Whether no vacuum has built up, so that the arm goes back without the object.
+        missed_grasp: Whether the gripper has not grasped the object, so that the arm goes back.
     """
 
     plan: Plan | None = None
@@ -68,14 +72,14 @@ class ExecutorState(Message):
     contact_time: float = math.inf
     waited: float = 0.0
     grip_wait: float = 0.0
-    has_no_seal: bool = False
+    missed_grasp: bool = False
 
     @property
     def lowered_distance(self) -> float:
         """Distance between the planned and the actual release height [m]."""
         if not isinstance(self.plan, PickPlacePlan) or self.plan.guarded_descent is None:
             return 0.0
-        if self.has_no_seal:
+        if self.missed_grasp:
             return 0.0
         return self.plan.guarded_descent.depth_at(self.contact_time)
 
@@ -204,7 +208,7 @@ class PickPlaceExecutor(LeafSystem):
     def _update(self, context: Context, state: State) -> EventStatus:
         current = self.state(context)
         time = context.get_time()
-        updated = self._await_vacuum(context, self._detect_contact(context, current))
+        updated = self._await_grip(context, self._detect_contact(context, current))
         has_input = self._plan.HasValue(context)
         move: PlannedMove = self._plan.Eval(context) if has_input else PlannedMove()
         is_new = move.plan is not None and move.number != current.number
@@ -215,10 +219,11 @@ class PickPlaceExecutor(LeafSystem):
             state.get_mutable_abstract_state(int(self._state)).set_value(updated)
         return EventStatus.Succeeded()
 
-    def _await_vacuum(self, context: Context, state: ExecutorState) -> ExecutorState:
+    def _await_grip(self, context: Context, state: ExecutorState) -> ExecutorState:
         """Return the state, delayed if a grasp is about to end without enough vacuum.
 
-        If no vacuum builds up in `grip_timeout`, the arm goes back.
+        If no vacuum builds up in `grip_timeout`, or the jaws close without an object, the arm goes
+        back.
         """
         gripper, schedule = self._cell.gripper, state.schedule
         if isinstance(schedule, RecordedSchedule):
@@ -226,12 +231,7 @@ class PickPlaceExecutor(LeafSystem):
             if all(abs(time - t) > EXECUTOR_UPDATE_PERIOD / 2 for t in schedule.wait_times):
                 return state
             return replace(state, waited=state.waited + EXECUTOR_UPDATE_PERIOD)
-        if (
-            not isinstance(gripper, SuctionGripper)
-            or schedule is None
-            or state.has_no_seal
-            or not self._vacuum.HasValue(context)
-        ):
+        if schedule is None or state.missed_grasp:
             return state
         elapsed = state.elapsed(context.get_time())
         tool = schedule.tool_at(elapsed)
@@ -240,20 +240,49 @@ class PickPlaceExecutor(LeafSystem):
             return replace(state, grip_wait=0.0) if state.grip_wait else state
         if not tool or not ends_before_next_update:
             return state
+        if not isinstance(gripper, SuctionGripper):
+            is_empty = self._are_jaws_empty(context, schedule, elapsed)
+            return self._withdraw(state, elapsed) if is_empty else state
+        if not self._vacuum.HasValue(context):
+            return state
         vacuum = float(self._vacuum.Eval(context)[list(self._tools).index(tool)])
         if vacuum >= gripper.lift_vacuum * gripper.full_vacuum:
             return state
         if state.grip_wait + EXECUTOR_UPDATE_PERIOD > gripper.grip_timeout:
             if vacuum >= gripper.detection_vacuum:
                 return state
-            assert state.plan is not None
-            withdrawal = build_withdrawal_schedule(schedule, state.plan, self._cell, elapsed)
-            return replace(state, schedule=withdrawal, has_no_seal=True)
+            return self._withdraw(state, elapsed)
         return replace(
             state,
             waited=state.waited + EXECUTOR_UPDATE_PERIOD,
             grip_wait=state.grip_wait + EXECUTOR_UPDATE_PERIOD,
         )
+
+    def _are_jaws_empty(self, context: Context, schedule: CommandSchedule, time: float) -> bool:
+        """Return whether all jaws have reached their commanded positions, beyond the object.
+
+        Args:
+            context: Context of the executor.
+            schedule: Schedule of the plan.
+            time: Time at the end of the grasp since the start of the plan [s].
+        """
+        count = self._num_actuated_joints
+        if not count or not self._gripper_state.HasValue(context):
+            return False
+        positions = np.asarray(self._gripper_state.Eval(context))[:count]
+        return bool((schedule.gripper_joints(time) - positions < MIN_JAW_SQUEEZE).all())
+
+    def _withdraw(self, state: ExecutorState, time: float) -> ExecutorState:
+        """Return the state of an arm that goes back without the object.
+
+        Args:
+            state: State during a grasp.
+            time: Time since the start of the plan [s].
+        """
+        assert state.plan is not None
+        assert state.schedule is not None
+        withdrawal = build_withdrawal_schedule(state.schedule, state.plan, self._cell, time)
+        return replace(state, schedule=withdrawal, missed_grasp=True)
 
     def _detect_contact(self, context: Context, state: ExecutorState) -> ExecutorState:
         """Return the state, updated if contact occurs during a guarded descent."""
@@ -321,7 +350,7 @@ class PickPlaceExecutor(LeafSystem):
         status = ExecutorStatus(
             state.number,
             stage,
-            state.has_no_seal,
+            state.missed_grasp,
             state.bellows_extension,
             self._felt_mass(state),
             math.isfinite(state.contact_time),

@@ -87,7 +87,8 @@ class PickPlaceResult:
         plan: Plan that was executed, the last one of several grasps.
         poses: Poses X_TO at the end, by name.
         grasped: Whether the gripper held an object.
-        has_no_seal: Whether no vacuum built up, so that the arm went back without the object.
+        missed_grasp: Whether the arm went back without the object: no vacuum built up, or the jaws
+            met nothing.
         num_grips: Number of grasps that were tried one after the other, see `Regrip`.
         drop_time: Time at which the object came off by overload [s]; NaN if it did not.
         max_load_ratio: Largest ratio of the load to the load capacity of the gripper.
@@ -116,7 +117,7 @@ class PickPlaceResult:
     simulated_time: float
     samples: ActionSamples | None = field(repr=False, default=None)
     has_ended: bool = True
-    has_no_seal: bool = False
+    missed_grasp: bool = False
     num_grips: int = 1
 
     @property
@@ -339,7 +340,7 @@ class StationSimulation:
             required = bodies_to_wake(state.schedule, self._affected, elapsed)
             end = state.schedule.end_time + POST_MOTION_WAIT
             held_time = state.schedule.held_time(elapsed)
-            expects_grasp = held_time + STEP_PERIOD <= elapsed < end and not state.has_no_seal
+            expects_grasp = held_time + STEP_PERIOD <= elapsed < end and not state.missed_grasp
         self._sleep.update(self.root, required, self.gripper.status, expects_grasp=expects_grasp)
         start = self._num_steps * STEP_PERIOD + _TIME_MARGIN
         for k in range(_GRIPPER_UPDATES_PER_STEP):
@@ -536,7 +537,7 @@ class StationSimulation:
             max_tracking_error=max_tracking_error,
             simulated_time=self.root.get_time(),
             samples=self.recorded_samples(),
-            has_no_seal=self.executor_state.has_no_seal,
+            missed_grasp=self.executor_state.missed_grasp,
             has_ended=self.finished_plan == self.executor_state.number and self.is_at_rest,
         )
 
@@ -588,7 +589,7 @@ def execute_grips(
     while True:
         result = simulation.execute(plan)
         tried.append(plan.held)
-        if not result.has_no_seal or regrip is None or len(tried) >= max_grips:
+        if not result.missed_grasp or regrip is None or len(tried) >= max_grips:
             break
         found = regrip(tried)
         if isinstance(found, PlanningFailure):

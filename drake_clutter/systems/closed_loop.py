@@ -21,7 +21,7 @@ from drake_clutter.planning.pick_place_plan import (
     PlanningFailureReason,
 )
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
-from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.planning.planner_config import ANY_OVERLAP, PlannerConfig
 from drake_clutter.scenes.action_samples import ActionSamples
 from drake_clutter.scenes.geometry import transport_pose
 from drake_clutter.scenes.interfaces import MoveResult, Outcome
@@ -49,6 +49,7 @@ from drake_clutter.tasks.exploration_task import MoveAttempt
 OBSERVATION_TO_PLAN_LATENCY = 1.15
 """Simulated time from an observation to its plan [s]: 0.15 for perception, 1 for planning."""
 GUARDED_PLANNER_CONFIG = PlannerConfig(
+    max_overlap=ANY_OVERLAP,
     max_guarded_descent=0.08,
     descent_start_offset=0.007,
     carry_clearance=CarryClearance(position_uncertainty=0.0055, height_uncertainty=0.007),
@@ -56,8 +57,8 @@ GUARDED_PLANNER_CONFIG = PlannerConfig(
 """Planner config for poses from images, with a guarded descent before the release.
 
 Images show only the top of a box in a pile, so its height is wrong if its class is. The detected
-height of the support is inaccurate, too. 95 % of the positions of the shipped detector are within
-5.5 mm.
+height of the support is inaccurate, too. Detected objects may overlap. 95 % of the positions of the
+shipped detector are within 5.5 mm.
 """
 
 
@@ -290,7 +291,7 @@ class ClosedLoop:
             outcome = replace(outcome, failure_reason=plan.reason.value)
             return MoveAttempt(decision, outcome, self.perception)
         assert decision.move is not None
-        if isinstance(plan, PlanningFailure) or self.simulation.executor_state.has_no_seal:
+        if isinstance(plan, PlanningFailure) or self.simulation.executor_state.missed_grasp:
             picked = decision.move.pick
             outcome = evaluate_no_grasp(before, self.simulation.scene, picked, self._config.settle)
             outcome = replace(outcome, detail="no vacuum built up")

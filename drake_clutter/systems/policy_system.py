@@ -180,7 +180,7 @@ class PolicySystem(LeafSystem):
         finished, lowered_distance = self._finished.Eval(context)
         if finished != now.request.number:
             return now
-        if self._has_no_seal(context):
+        if self._has_missed_grasp(context):
             tried = (*now.request.tried, response.plan.held)
             if len(tried) < self._max_grips:
                 number = now.request.number + 1
@@ -242,12 +242,12 @@ class PolicySystem(LeafSystem):
             excess_height = gap - lowered_distance - status.bellows_extension
         return Touch(status.felt_mass, excess_height)
 
-    def _has_no_seal(self, context: Context) -> bool:
+    def _has_missed_grasp(self, context: Context) -> bool:
         """Return whether the executor has found no vacuum at the grasp of the latest plan."""
         if not self._status.HasValue(context):
             return False
         status: ExecutorStatus = self._status.Eval(context)
-        return status.has_no_seal
+        return status.missed_grasp
 
     def after_observation(self, now: PolicyState, observation: Observation) -> PolicyState:
         """Return the state after an observation: with a request, or done.
