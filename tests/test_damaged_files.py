@@ -111,7 +111,7 @@ from drake_clutter.tasks.generation_task import ClutterGeneration, GenerationTas
 from drake_clutter.validation import load_config_as, override_config, to_plain
 from drake_clutter.visual_mesh import check_visual_mesh
 from drake_clutter.yaml_io import to_yaml
-from training.evaluate_explorers import EpisodeRecord
+from training.episode_files import EpisodeRecord
 from training.reaching_policy import ReachingPolicy
 from training.results_file import ResultsFile
 from training.target_set import TargetPair, load_target_set, save_target_set

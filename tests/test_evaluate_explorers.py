@@ -15,6 +15,7 @@ from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.statistics import mean_interval, ratio_interval
 from drake_clutter.validation import to_plain
 from training import evaluate_explorers as script
+from training.episode_files import collect_episodes, episodes_path
 from training.results_file import ResultsFile
 from training.script import RESULTS, SCENES
 
@@ -79,17 +80,17 @@ def test_episodes_are_run_once(tmp_path: Path) -> None:
     scenes = load_scene_dataset(SCENES / "sg_star_25.json", CATALOG)
     path = tmp_path / "random.jsonl.gz"
     options: dict[str, Any] = {"fidelity": "static", "seed": 0, "workers": 1}
-    records = script.collect_episodes(path, scenes, "random", 1, **options)
+    records = collect_episodes(path, scenes, "random", 1, **options)
     before = path.read_bytes()
-    assert script.collect_episodes(path, scenes, "random", 1, **options) == records
+    assert collect_episodes(path, scenes, "random", 1, **options) == records
     assert path.read_bytes() == before
-    assert script.collect_episodes(path, scenes, "random", 2, **options)[:1] == records
+    assert collect_episodes(path, scenes, "random", 2, **options)[:1] == records
     assert EpisodeResult.from_record(records[0]).hidden == scenes.scenes[0].num_hidden
     with pytest.raises(
         InputError,
         match=r"random\.jsonl\.gz: holds records with a different header \(agent, seed\)",
     ):
-        script.collect_episodes(path, scenes, "largest-clear", 1, **options | {"seed": 1})
+        collect_episodes(path, scenes, "largest-clear", 1, **options | {"seed": 1})
     with pytest.raises(InputError, match="--out: is missing"):
         script.main(tmp_path, only="sg_star_25", agents=["random"])
     with pytest.raises(InputError, match="--out: is missing"):
@@ -135,14 +136,14 @@ def test_episodes_with_another_placement_rule_are_not_resumed(name: str, tmp_pat
     """The configuration of the published episodes has no doubt about what carries an object."""
     scenes = load_scene_dataset(SCENES / f"{name}.json", CATALOG)
     for agent in script.TABLES[name][1]:
-        path = script.episodes_path(script.EPISODES, name, agent)
+        path = episodes_path(script.EPISODES, name, agent)
         if path.exists():
             copy = Path(copyfile(path, tmp_path / path.name))
             options: dict[str, Any] = {"fidelity": "settle", "seed": 2000, "workers": 1}
             with pytest.raises(
                 InputError, match=r"holds records with a different header \(config\)"
             ):
-                script.collect_episodes(copy, scenes, agent, 3, **options)
+                collect_episodes(copy, scenes, agent, 3, **options)
 
 
 @pytest.mark.parametrize("name", ["table2.json", "table3.json"])

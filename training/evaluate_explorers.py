@@ -8,20 +8,12 @@ interrupted run is resumed by the same command.
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from pydantic import BaseModel
 
-from drake_clutter.agents.backend_factory import FIDELITIES
-from drake_clutter.agents.episode_evaluation import (
-    EpisodeResult,
-    EpisodeRunner,
-    EpisodeSpec,
-    summarize_episodes,
-)
+from drake_clutter.agents.episode_evaluation import EpisodeResult, summarize_episodes
 from drake_clutter.agents.explorers import ORACLE, PRETRAINED_EXPLORERS, make_policy_factory
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
@@ -32,10 +24,20 @@ from drake_clutter.records import read_jsonl
 from drake_clutter.reports.terminal_text import evaluation_table_rows
 from drake_clutter.scenes.scene_dataset import SceneDataset, load_scene_dataset
 from drake_clutter.statistics import ratio_interval
-from drake_clutter.tasks.episode import current_fidelity
 from drake_clutter.tasks.exploration_task import TerminationReason
-from drake_clutter.validation import Count, CountOrZero, NonEmptyText, to_plain
-from training.results_file import ResultsFile, Row, collect_records
+from drake_clutter.validation import to_plain
+from training.episode_files import (
+    MAX_MOVES,
+    AgentsOption,
+    CountOption,
+    EpisodesSeedOption,
+    FidelityOption,
+    SetNameOption,
+    check_evaluation,
+    collect_episodes,
+    episodes_path,
+)
+from training.results_file import ResultsFile, Row
 from training.script import (
     RESULTS,
     SCENES,
@@ -48,7 +50,7 @@ from training.script import (
 
 EPISODES = RESULTS / "episodes"
 """Folder of the published episodes."""
-MOVE_LIMITS = (10, 20)
+MOVE_LIMITS = (10, MAX_MOVES)
 """Numbers of moves within which a success counts."""
 BASELINES = {"ceiling": ORACLE, "largest_clear": "largest-clear"}
 """Explorers whose numbers of moves the others' are divided by, by their names in results files."""
@@ -82,64 +84,6 @@ TABLES = dict.fromkeys(YCB7_SETS, ("table2", YCB7_EXPLORERS)) | dict.fromkeys(
 """By scene dataset: the results file of its rows, and the explorers that are evaluated on it."""
 
 
-class EpisodeRecord(BaseModel):
-    """Record of an episode; see `EpisodeResult`."""
-
-    scene: NonEmptyText
-    agent: NonEmptyText
-    ended: NonEmptyText
-    hidden: Count
-    found: CountOrZero
-    moves: CountOrZero
-    found_after: list[CountOrZero]
-    not_carried_out: CountOrZero
-    commit: str
-
-
-def episodes_path(folder: Path, set_name: str, agent: str) -> Path:
-    """Return the record file of an explorer's episodes on a scene dataset."""
-    if agent.endswith(".safetensors"):
-        agent = f"{Path(agent).stem}_{checkpoint_sha256(agent, PRETRAINED_EXPLORERS)[:8]}"
-    return folder / f"{set_name}_{agent}.jsonl.gz"
-
-
-def collect_episodes(
-    path: Path,
-    scenes: SceneDataset,
-    agent: str,
-    count: int,
-    *,
-    fidelity: str,
-    seed: int,
-    workers: int,
-) -> list[Row]:
-    """Return the records of an explorer's episodes; those that the file lacks are run.
-
-    Args:
-        path: The record file.
-        scenes: A scene dataset in `training/scenes`.
-        agent: See `make_policy_factory`.
-        count: Number of episodes, on the first scenes of the set.
-        fidelity: Model of the moves.
-        seed: Seed of the episodes.
-        workers: Number of processes.
-    """
-    config = ClutterConfig()
-    header = {
-        "set": scenes.name,
-        "sha256": scenes.sha256,
-        "agent": agent,
-        "weights": checkpoint_sha256(agent, PRETRAINED_EXPLORERS),
-        "seed": seed,
-        "fidelity": fidelity,
-        "moves": max(MOVE_LIMITS),
-        "config": to_plain(config),
-    }
-    player = partial(EpisodeRunner, config, None, max(MOVE_LIMITS), seed, fidelity)
-    episodes = [EpisodeSpec(SCENES / scenes.name, k, agent, k) for k in range(count)]
-    return collect_records(path, header, player, episodes, schema=EpisodeRecord, workers=workers)
-
-
 def summarize(
     results: Sequence[EpisodeResult],
     baselines: Mapping[str, Sequence[EpisodeResult]],
@@ -154,7 +98,6 @@ def summarize(
         max_objects: Largest number of objects of a scene.
     """
     row = summarize_episodes(results, MOVE_LIMITS, max_objects)
-    max_moves = max(MOVE_LIMITS)
     for name, baseline in baselines.items():
         moves = [
             (ours.moves, theirs.moves)
@@ -164,7 +107,7 @@ def summarize(
         ratio = sum(m for m, _ in moves) / sum(m for _, m in moves) if moves else None
         row[f"moves_to_{name}"] = ratio
         row[f"moves_to_{name}_ci95"] = ratio_interval(
-            [m for m, _ in moves], [m for _, m in moves], (1, max_moves), (max_moves, 1)
+            [m for m, _ in moves], [m for _, m in moves], (1, MAX_MOVES), (MAX_MOVES, 1)
         )
         row[f"both_with_{name}"] = len(moves)
     return row
@@ -234,53 +177,16 @@ def evaluate_set(
     return rows
 
 
-def check_evaluation(
-    fidelity: str, out: Path | None, is_published_folder: bool, is_part: bool
-) -> str:
-    """Return the current name of a fidelity if an evaluation leaves published results whole.
-
-    Args:
-        fidelity: Model of the moves.
-        out: Results file; None for the published ones.
-        is_published_folder: Whether the records are among the published ones.
-        is_part: Whether only some policies or scenes are evaluated.
-
-    Raises:
-        InputError: A published file would get other results, or the fidelity is unknown.
-    """
-    fidelity = current_fidelity(fidelity)
-    if fidelity not in FIDELITIES:
-        raise InputError(f"--fidelity {fidelity}; expected {', '.join(FIDELITIES)}")
-    if is_published_folder and fidelity != "settle":
-        raise InputError("DIR: is for episodes under settle; give another folder")
-    if out is None and (is_part or fidelity != "settle"):
-        raise InputError(
-            "--out: is missing; the published tables are all agents' on all scenes under settle:"
-            " give a file for others"
-        )
-    return fidelity
-
-
 def main(
     folder: Annotated[
         Path, typer.Argument(metavar="DIR", help="Folder for the records of the episodes.")
     ] = EPISODES,
     workers: WorkersOption = 1,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the episodes.")] = 2000,
-    fidelity: Annotated[
-        str,
-        typer.Option(help=f"Model of the moves: {', '.join(FIDELITIES)}. Published: settle."),
-    ] = "settle",
-    count: Annotated[
-        int | None, typer.Option(min=1, help="Only the first N scenes of each set.")
-    ] = None,
-    only: Annotated[
-        str | None, typer.Option(metavar="TEXT", help="Only sets whose name contains this text.")
-    ] = None,
-    agents: Annotated[
-        list[str] | None,
-        typer.Option("--agent", help="An explorer instead of the table's. May be repeated."),
-    ] = None,
+    seed: EpisodesSeedOption = 2000,
+    fidelity: FidelityOption = "settle",
+    count: CountOption = None,
+    only: SetNameOption = None,
+    agents: AgentsOption = None,
     out: ResultsOption = None,
 ) -> None:
     """Run the episodes that are missing, and print the table.

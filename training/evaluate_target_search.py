@@ -7,15 +7,13 @@ policy. An interrupted run is resumed by the same command.
 """
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from drake_clutter.agents.backend_factory import FIDELITIES
-from drake_clutter.agents.episode_evaluation import EpisodeResult, EpisodeRunner, EpisodeSpec
+from drake_clutter.agents.episode_evaluation import EpisodeResult
 from drake_clutter.agents.explorers import AREA_REDUCTION, ORACLE, PRETRAINED_EXPLORERS
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
@@ -27,8 +25,18 @@ from drake_clutter.statistics import mean_interval, ratio_interval, wilson_inter
 from drake_clutter.tasks.exploration_task import TerminationReason
 from drake_clutter.tasks.oracle_search import Solvability
 from drake_clutter.validation import to_plain
-from training.evaluate_explorers import EpisodeRecord, check_evaluation, episodes_path
-from training.results_file import ResultsFile, Row, collect_records
+from training.episode_files import (
+    MAX_MOVES,
+    AgentsOption,
+    CountOption,
+    EpisodesSeedOption,
+    FidelityOption,
+    SetNameOption,
+    check_evaluation,
+    collect_episodes,
+    episodes_path,
+)
+from training.results_file import ResultsFile, Row
 from training.script import (
     RESULTS,
     SCENES,
@@ -44,8 +52,6 @@ EPISODES = RESULTS / "target_episodes"
 """Folder of the published episodes."""
 RESULTS_FILE = RESULTS / "target_search.json"
 """Published results."""
-MAX_MOVES = 20
-"""Maximum number of moves of an episode."""
 ALLOWED_RATIO = 1.25
 """Moves that a search may use, relative to the oracle's plan, to count as efficient."""
 _POLICIES = ("random", "largest-clear", AREA_REDUCTION)
@@ -55,46 +61,6 @@ SETS = {
     "sg_14": (*_POLICIES, "student-14", ORACLE),
 }
 """By target set, which has the name of its scene dataset: the policies that are evaluated on it."""
-
-
-def collect_episodes(
-    path: Path,
-    targets: TargetSet,
-    agent: str,
-    count: int,
-    *,
-    fidelity: str,
-    seed: int,
-    workers: int,
-) -> list[Row]:
-    """Return the records of a policy's episodes; those that the file lacks are run.
-
-    Args:
-        path: The record file.
-        targets: The target set.
-        agent: See `make_policy_factory`.
-        count: Number of episodes, on the first pairs of the set.
-        fidelity: Model of the moves.
-        seed: Seed of the episodes.
-        workers: Number of processes.
-    """
-    config = ClutterConfig()
-    header = {
-        "set": targets.name,
-        "sha256": targets.sha256,
-        "agent": agent,
-        "weights": checkpoint_sha256(agent, PRETRAINED_EXPLORERS),
-        "seed": seed,
-        "fidelity": fidelity,
-        "moves": MAX_MOVES,
-        "config": to_plain(config),
-    }
-    runner = partial(EpisodeRunner, config, None, MAX_MOVES, seed, fidelity)
-    episodes = [
-        EpisodeSpec(SCENES / targets.scenes, pair.scene, agent, k, pair.target)
-        for k, pair in enumerate(targets.pairs[:count])
-    ]
-    return collect_records(path, header, runner, episodes, schema=EpisodeRecord, workers=workers)
 
 
 def is_revealed(result: EpisodeResult) -> bool:
@@ -205,20 +171,11 @@ def main(
         Path, typer.Argument(metavar="DIR", help="Folder for the records of the episodes.")
     ] = EPISODES,
     workers: WorkersOption = 1,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the episodes.")] = 2000,
-    fidelity: Annotated[
-        str, typer.Option(help=f"Model of the moves: {', '.join(FIDELITIES)}. Published: settle.")
-    ] = "settle",
-    count: Annotated[
-        int | None, typer.Option(min=1, help="Only the first N pairs of each set.")
-    ] = None,
-    only: Annotated[
-        str | None, typer.Option(metavar="TEXT", help="Only sets whose name contains this text.")
-    ] = None,
-    agents: Annotated[
-        list[str] | None,
-        typer.Option("--agent", help="A policy instead of the set's. May be repeated."),
-    ] = None,
+    seed: EpisodesSeedOption = 2000,
+    fidelity: FidelityOption = "settle",
+    count: CountOption = None,
+    only: SetNameOption = None,
+    agents: AgentsOption = None,
     out: ResultsOption = None,
 ) -> None:
     """Run the episodes that are missing, and print the table."""
