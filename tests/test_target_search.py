@@ -175,7 +175,7 @@ def test_the_area_policy_looks_where_the_target_fits(target: str, first: str) ->
     assert JUDGE.find_instability(scene) is None
     backend = make_teleport_backend_factory("static", WORLD)(scene, rng())
     sought = require_target("another", scene, [], rng())
-    policy = make_policy_factory("area-reduction", WORLD, target=sought)(backend)
+    policy = make_policy_factory("area-reduction", WORLD, with_target=True)(backend, target=sought)
     assert policy(backend.belief, backend.observation, rng()).move == Move(first)
 
 
@@ -190,9 +190,15 @@ def test_policies_that_need_a_target(tmp_path: Path) -> None:
     assert (network.finds_target, numbers) == (True, kinds)
     with pytest.raises(InputError, match="looks for one object; expected a target"):
         make_policy_factory(str(path), WORLD)
+    backend = make_teleport_backend_factory("static", WORLD)(SCENE, rng())
     can = require_target("can", SCENE, IN_VIEW, rng())
+    make_policy = make_policy_factory(str(path), WORLD, with_target=True)
     with pytest.raises(InputError, match="was not trained with tomato_soup_can; train one"):
-        make_policy_factory(str(path), WORLD, target=can)
+        make_policy(backend, target=can)
+    for agent in ("area-reduction", str(path)):
+        make_policy = make_policy_factory(agent, WORLD, with_target=True)
+        with pytest.raises(InputError, match="looks for one object; expected a target"):
+            make_policy(backend)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 
 from drake_clutter.agents.backend_factory import make_backend_factory
-from drake_clutter.agents.explorers import PolicyFactory, make_policy_factory
+from drake_clutter.agents.explorers import make_policy_factory
 from drake_clutter.catalog import load_catalog
 from drake_clutter.config import ClutterConfig
 from drake_clutter.scenes.scene import Scene
@@ -109,7 +109,7 @@ class EpisodeRunner:
         self._catalog = load_catalog(catalog_folder)
         self._load_dataset = cache(partial(load_scene_dataset, catalog=self._catalog))
         self._make_backend = make_backend_factory(fidelity, config)
-        self._policy_factories: dict[str, PolicyFactory] = {}
+        self._make_policy_factory = cache(partial(make_policy_factory, config=config))
 
     def _load_scene(self, episode: EpisodeSpec) -> Scene:
         if episode.scene_index is None:
@@ -125,14 +125,9 @@ class EpisodeRunner:
         if episode.target:
             in_view = [d.name for d in backend.perception.observation.detections]
             target = require_target(episode.target, backend.scene, in_view, rng)
-            factory = make_policy_factory(episode.agent, self._config, target=target)
-        else:
-            if episode.agent not in self._policy_factories:
-                self._policy_factories[episode.agent] = make_policy_factory(
-                    episode.agent, self._config
-                )
-            factory = self._policy_factories[episode.agent]
-        task = run_episode(backend, factory(backend), max_moves=self._max_moves, target=target)
+        make_policy = self._make_policy_factory(episode.agent, with_target=target is not None)
+        policy = make_policy(backend, target=target)
+        task = run_episode(backend, policy, max_moves=self._max_moves, target=target)
         transitions = task.transitions
         found_after = np.cumsum([len(t.newly_found) for t in transitions], dtype=int)
         return EpisodeResult(

@@ -4,11 +4,13 @@ The baselines of Kumar et al. 2022 are random exploration (RE) and largest first
 """
 
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
+from typing import Protocol
 
 import numpy as np
 
 from drake_clutter.agents.area_reduction import AreaReductionExplorer
-from drake_clutter.config import ClutterConfig
+from drake_clutter.config import ClutterConfig, ExplorationConfig
 from drake_clutter.files import InputError
 from drake_clutter.learning.pretrained import checkpoint_path
 from drake_clutter.scenes.interfaces import Detection, Move, Observation
@@ -17,7 +19,7 @@ from drake_clutter.scenes.scene import TRAY
 from drake_clutter.tasks.belief import Belief, Decision, Policy, legal_moves
 from drake_clutter.tasks.episode import Backend
 from drake_clutter.tasks.oracle_search import OracleSearch
-from drake_clutter.tasks.search_target import SearchTarget
+from drake_clutter.tasks.search_target import SearchTarget, no_target_error
 
 
 def random_explorer(belief: Belief, observation: Observation, rng: np.random.Generator) -> Decision:
@@ -123,8 +125,17 @@ class OracleExplorer:
         return Decision(self._plan.pop(0) if self._plan else None)
 
 
-PolicyFactory = Callable[[Backend], Policy]
-"""Creates the policy of an episode; a privileged one may observe the backend's true scene."""
+class PolicyFactory(Protocol):
+    """Creates the policies of episodes, which share what the factory has loaded."""
+
+    def __call__(self, backend: Backend, *, target: SearchTarget | None = None) -> Policy:
+        """Return the policy of an episode.
+
+        Args:
+            backend: Backend of the episode, whose true scene a privileged policy observes.
+            target: What the episode looks for; None for all objects.
+        """
+
 
 BASELINE_POLICIES: dict[str, Policy] = {
     "random": random_explorer,
@@ -146,11 +157,21 @@ AREA_REDUCTION = "area-reduction"
 """Name of the agent that is an `AreaReductionExplorer`."""
 
 
+def _make_area_policy(
+    config: ExplorationConfig, backend: Backend, *, target: SearchTarget | None = None
+) -> Policy:
+    """Return the area policy of an episode; see `PolicyFactory`."""
+    if target is None:
+        raise no_target_error(AREA_REDUCTION)
+    return AreaReductionExplorer(target.object_class, config)
+
+
 def make_policy_factory(
     name: str,
     config: ClutterConfig,
     classes: Collection[str] = (),
-    target: SearchTarget | None = None,
+    *,
+    with_target: bool = False,
 ) -> PolicyFactory:
     """Return a factory of the policies of an agent.
 
@@ -159,22 +180,21 @@ def make_policy_factory(
             or the file of a checkpoint.
         config: Configuration of the simulated world.
         classes: Names of the object classes that will occur, as far as they are known.
-        target: What the episodes look for; None for all objects.
+        with_target: Whether the episodes look for a target, which the factory is given for each.
 
     Raises:
         InputError: The agent is unknown, the file is not a checkpoint of an exploration policy,
             the policy was not trained with one of the classes, or it needs a target.
     """
     if name in BASELINE_POLICIES:
-        return lambda _: BASELINE_POLICIES[name]
+        return lambda backend, *, target=None: BASELINE_POLICIES[name]
     if name == ORACLE:
         search = OracleSearch(config)
-        return lambda backend: OracleExplorer(backend, search, target)
+        return lambda backend, *, target=None: OracleExplorer(backend, search, target)
     if name == AREA_REDUCTION:
-        if target is None:
-            raise InputError(f"--agent {name}: looks for one object; expected a target")
-        policy = AreaReductionExplorer(target.object_class, config.exploration)
-        return lambda _: policy
+        if not with_target:
+            raise no_target_error(name)
+        return partial(_make_area_policy, config.exploration)
     if name not in PRETRAINED_EXPLORERS and not name.endswith(".safetensors"):
         allowed = ", ".join([*BASELINE_POLICIES, *PRETRAINED_EXPLORERS, AREA_REDUCTION, ORACLE])
         raise InputError(f"--agent {name}; expected {allowed}, or a .safetensors file")
@@ -182,4 +202,4 @@ def make_policy_factory(
     # Imported late: needs PyTorch, which is not required for the other agents.
     from drake_clutter.agents.learned_explorer import LearnedExplorerFactory
 
-    return LearnedExplorerFactory(path, config.exploration, classes, target)
+    return LearnedExplorerFactory(path, config.exploration, classes, with_target=with_target)

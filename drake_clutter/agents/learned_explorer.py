@@ -28,7 +28,7 @@ from drake_clutter.tasks.exploration_graph import (
     RENAMED_FEATURES,
     build_exploration_graph,
 )
-from drake_clutter.tasks.search_target import SearchTarget
+from drake_clutter.tasks.search_target import SearchTarget, no_target_error
 from drake_clutter.validation import Flag, NetworkWidth, NonEmptyText, StrictModel, validate
 
 TEACHER = "teacher"
@@ -201,7 +201,8 @@ class LearnedExplorerFactory:
         path: Path,
         config: ExplorationConfig,
         classes: Collection[str] = (),
-        target: SearchTarget | None = None,
+        *,
+        with_target: bool = False,
     ) -> None:
         """Load a checkpoint of `train_explorer_ppo.py` or `train_explorer_dagger.py`.
 
@@ -209,7 +210,7 @@ class LearnedExplorerFactory:
             path: File of the checkpoint.
             config: Clearances of placements.
             classes: Names of the object classes that will occur, as far as they are known.
-            target: What the episodes look for; None for all objects.
+            with_target: Whether the episodes look for a target.
 
         Raises:
             InputError: The file cannot be read, is not a checkpoint of an exploration policy, the
@@ -219,20 +220,32 @@ class LearnedExplorerFactory:
         self._config = config
         checkpoint = load_checkpoint(path)
         self._network, self._node_kind_ids = load_explorer(checkpoint, path)
-        wanted = () if target is None else (target.object_class.name,)
-        _check_classes([*classes, *wanted], self._node_kind_ids, path)
-        if self._network.finds_target and target is None:
-            raise InputError(f"--agent {path}: looks for one object; expected a target")
-        self._target = target if self._network.finds_target else None
+        _check_classes(classes, self._node_kind_ids, path)
+        if self._network.finds_target and not with_target:
+            raise no_target_error(path)
         self.privileged = checkpoint.metadata["kind"] == TEACHER
 
-    def __call__(self, backend: Backend | None = None) -> LearnedExplorer:
-        """Return the policy of an episode; only a privileged policy needs the backend."""
+    def __call__(
+        self, backend: Backend | None = None, *, target: SearchTarget | None = None
+    ) -> LearnedExplorer:
+        """Return the policy of an episode; only a privileged policy needs the backend.
+
+        Args:
+            backend: Backend of the episode.
+            target: What the episode looks for; None for all objects.
+
+        Raises:
+            InputError: The policy was not trained with the class of the target, or needs a target.
+        """
+        if target is not None:
+            _check_classes([target.object_class.name], self._node_kind_ids, self._path)
+        elif self._network.finds_target:
+            raise no_target_error(self._path)
         return LearnedExplorer(
             self._network,
             self._node_kind_ids,
             self._path,
             self._config,
             backend if self.privileged else None,
-            self._target,
+            target if self._network.finds_target else None,
         )

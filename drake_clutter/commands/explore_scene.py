@@ -115,7 +115,8 @@ def explore_scene(
     if target_text:
         in_view = [d.name for d in backend.perception.observation.detections]
         target = require_target(target_text, scene, in_view, rng)
-    policy = make_policy_factory(agent_name, config, target=target)(backend)
+    make_policy = make_policy_factory(agent_name, config, with_target=target is not None)
+    policy = make_policy(backend, target=target)
     if target is not None and retrieve:
         policy = RetrievingExplorer(policy, target, config.cell, config.exploration)
     if until is StopCriterion.BELIEF:

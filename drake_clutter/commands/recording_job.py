@@ -1,16 +1,13 @@
 """What determines a recorded data set: scenes, policy, configuration, rates, images, variation."""
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import drake_clutter
-from drake_clutter.agents.explorers import (
-    PRETRAINED_EXPLORERS,
-    PolicyFactory,
-    make_policy_factory,
-)
+from drake_clutter.agents.explorers import PRETRAINED_EXPLORERS, make_policy_factory
 from drake_clutter.commands.episode_scenes import SceneSource
 from drake_clutter.commands.explore_scene import move_list_policy
 from drake_clutter.config import ClutterConfig
@@ -22,6 +19,7 @@ from drake_clutter.recording.randomization import RandomizationConfig
 from drake_clutter.scenes.interfaces import Move
 from drake_clutter.station.motion_recorder import DEFAULT_RATE
 from drake_clutter.tasks.belief import Policy
+from drake_clutter.tasks.episode import Backend
 from drake_clutter.validation import to_plain
 
 RANDOM = "random"
@@ -86,7 +84,7 @@ class RecordingJob:
             return "moves"
         return getattr(self.policy, "__qualname__", type(self.policy).__qualname__)
 
-    def make_policy_factory(self) -> PolicyFactory:
+    def make_policy_factory(self) -> Callable[[Backend], Policy]:
         """Return the factory of the policies of the episodes.
 
         Raises:

@@ -14,7 +14,6 @@ from importlib.metadata import version
 import numpy as np
 
 import drake_clutter
-from drake_clutter.agents.explorers import PolicyFactory
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.config import ClutterConfig
 from drake_clutter.perception.label_detector import LabelDetector
@@ -29,7 +28,7 @@ from drake_clutter.scenes.scene import TRAY, Pose, Scene
 from drake_clutter.seeding import item_rng
 from drake_clutter.station.arm_executor import ArmExecutor
 from drake_clutter.tasks.belief import Belief, Decision, Policy
-from drake_clutter.tasks.episode import SteppedBackend, run_episode
+from drake_clutter.tasks.episode import Backend, SteppedBackend, run_episode
 from drake_clutter.tasks.exploration_task import StopCriterion, TerminationReason, Transition
 
 POLICY_ERROR = "policy error"
@@ -42,7 +41,7 @@ class _PolicyError(Exception):
 
 def record_episode(
     scene: Scene,
-    make_policy: PolicyFactory,
+    make_policy: Callable[[Backend], Policy],
     config: ClutterConfig,
     header: EpisodeHeader,
     *,

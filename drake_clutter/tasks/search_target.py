@@ -2,6 +2,7 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -79,3 +80,8 @@ def missing_target_error(text: str, scene: Scene) -> InputError:
     classes = sorted({o.object_class.name for o in scene.objects})
     allowed = ", ".join(dict.fromkeys([*classes, *scene.names, RANDOM_HIDDEN]))
     return InputError(f"target: {text}: is not in the scene; expected {allowed}")
+
+
+def no_target_error(agent: str | Path) -> InputError:
+    """Return the error of a policy that looks for one object in an episode without a target."""
+    return InputError(f"--agent {agent}: looks for one object; expected a target")
