@@ -15,12 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from drake_clutter.learning.checkpoint import (
-    learner_tensors,
-    load_tensors,
-    restore_learner,
-    save_tensors,
-)
+from drake_clutter.learning.checkpoint import load_learner, save_learner
 from drake_clutter.seeding import item_rng
 from drake_clutter.validation import Count, Flag, NonEmptyText, Positive, Seed, config_class
 from training.reaching_demonstrations import Demonstration, ToolKinematics
@@ -122,12 +117,11 @@ class CloningLearner:
 
     def save(self, path: Path) -> None:
         """Write the state from which `load` continues the training."""
-        save_tensors(path, learner_tensors(self.network, self._optimizer), {"step": self.step})
+        save_learner(path, self.network, self._optimizer, {"step": self.step})
 
     def load(self, path: Path) -> None:
         """Continue a training of the same config and seed where `save` was called."""
-        tensors, state = load_tensors(path)
-        restore_learner(self.network, self._optimizer, tensors)
+        _, state = load_learner(path, self.network, self._optimizer)
         self.step = state["step"]
 
 

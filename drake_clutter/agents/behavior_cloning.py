@@ -23,10 +23,8 @@ from drake_clutter.agents.explorer_network import (
 )
 from drake_clutter.agents.rollouts import Rollout, collect_rollouts
 from drake_clutter.learning.checkpoint import (
-    learner_tensors,
-    load_tensors,
-    restore_learner,
-    save_tensors,
+    load_learner,
+    save_learner,
     tensors_with_prefix,
     with_current_keys,
 )
@@ -195,15 +193,13 @@ class BehaviorCloningLearner:
 
     def save(self, path: Path) -> None:
         """Write the complete state of the run; see `Learner`."""
-        tensors = learner_tensors(self.network, self._optimizer)
         arrays = {**self._observations, "moves": self._expert_actions}
-        tensors |= {f"states.{name}": torch.from_numpy(array) for name, array in arrays.items()}
-        save_tensors(path, tensors, {"step": self.step})
+        tensors = {f"states.{name}": torch.from_numpy(array) for name, array in arrays.items()}
+        save_learner(path, self.network, self._optimizer, {"step": self.step}, tensors)
 
     def load(self, path: Path) -> None:
         """Restore the state of a run of the same config, seed and teacher; see `Learner`."""
-        tensors, state = load_tensors(path)
-        restore_learner(self.network, self._optimizer, tensors)
+        tensors, state = load_learner(path, self.network, self._optimizer)
         arrays = with_current_keys(tensors_with_prefix(tensors, "states"), RENAMED_ARRAYS)
         self._observations = {name: value.numpy() for name, value in arrays.items()}
         self._expert_actions = self._observations.pop("moves")

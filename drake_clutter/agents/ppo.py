@@ -20,12 +20,7 @@ from drake_clutter.agents.explorer_network import (
     collate_graphs,
 )
 from drake_clutter.agents.rollouts import Rollout, collect_rollouts, make_policy_fn
-from drake_clutter.learning.checkpoint import (
-    learner_tensors,
-    load_tensors,
-    restore_learner,
-    save_tensors,
-)
+from drake_clutter.learning.checkpoint import load_learner, save_learner
 from drake_clutter.seeding import item_rng
 from drake_clutter.tasks.clutter_exploration import ClutterExploration
 from drake_clutter.validation import (
@@ -202,12 +197,11 @@ class PPOLearner:
     def save(self, path: Path) -> None:
         """Write the complete state of the run; see `Learner`."""
         state = {"step": self.step, "round": self._iteration}
-        save_tensors(path, learner_tensors(self.network, self._optimizer), state)
+        save_learner(path, self.network, self._optimizer, state)
 
     def load(self, path: Path) -> None:
         """Restore the state of a run of the same config and seed; see `Learner`."""
-        tensors, state = load_tensors(path)
-        restore_learner(self.network, self._optimizer, tensors)
+        _, state = load_learner(path, self.network, self._optimizer)
         self.step = state["step"]
         self._iteration = state["round"]
 

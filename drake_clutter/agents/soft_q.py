@@ -30,10 +30,8 @@ from drake_clutter.agents.replay_buffer import (
 )
 from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import (
-    learner_tensors,
-    load_tensors,
-    restore_learner,
-    save_tensors,
+    load_learner,
+    save_learner,
     tensors_with_prefix,
     with_current_keys,
 )
@@ -452,8 +450,7 @@ class SoftQLearner:
 
     def save(self, path: Path) -> None:
         """Write the complete state of the run; see `Learner`."""
-        tensors = learner_tensors(self.network, self._optimizer)
-        tensors |= {f"target.{name}": value for name, value in self._target.state_dict().items()}
+        tensors = {f"target.{name}": value for name, value in self._target.state_dict().items()}
         tensors |= {
             f"replay.{name}": torch.from_numpy(array[: self._buffer.num_added])
             for name, array in self._buffer.arrays.items()
@@ -474,14 +471,13 @@ class SoftQLearner:
                 )
             ],
         }
-        save_tensors(path, tensors, state)
+        save_learner(path, self.network, self._optimizer, state, tensors)
 
     def load(self, path: Path) -> None:
         """Restore the state of a run of the same config and seed; see `Learner`."""
-        tensors, saved_state = load_tensors(path)
+        tensors, saved_state = load_learner(path, self.network, self._optimizer)
         state = with_current_keys(saved_state, RENAMED_STATE)
         arrays = with_current_keys(tensors_with_prefix(tensors, "replay"), RENAMED_ARRAYS)
-        restore_learner(self.network, self._optimizer, tensors)
         self._target.load_state_dict(tensors_with_prefix(tensors, "target"))
         for name, value in arrays.items():
             self._buffer.arrays[name][: len(value)] = value.numpy()

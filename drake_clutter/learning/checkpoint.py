@@ -178,11 +178,24 @@ def tensors_with_prefix(tensors: Mapping[str, Tensor], prefix: str) -> dict[str,
     }
 
 
-def learner_tensors(network: nn.Module, optimizer: Optimizer) -> dict[str, Tensor]:
-    """Return the tensors of a network and its optimizer.
+def save_learner(
+    path: Path,
+    network: nn.Module,
+    optimizer: Optimizer,
+    state: Any,
+    tensors: Mapping[str, Tensor] | None = None,
+) -> None:
+    """Write the state of a training.
 
-    Returns:
-        Weights as `network.NAME`, state of the optimizer as `optimizer.PARAMETER_INDEX.NAME`.
+    Weights are written as `network.NAME`, the state of the optimizer as
+    `optimizer.PARAMETER_INDEX.NAME`.
+
+    Args:
+        path: The .safetensors file.
+        network: The network.
+        optimizer: Its optimizer.
+        state: `LearnerState` and anything else that JSON can represent.
+        tensors: Other tensors, by name.
     """
     weights = {f"network.{name}": value for name, value in network.state_dict().items()}
     optimizer_state = {
@@ -190,13 +203,20 @@ def learner_tensors(network: nn.Module, optimizer: Optimizer) -> dict[str, Tenso
         for index, parameter_state in optimizer.state_dict()["state"].items()
         for name, value in parameter_state.items()
     }
-    return weights | optimizer_state
+    save_tensors(path, {**weights, **optimizer_state, **(tensors or {})}, state)
 
 
-def restore_learner(
-    network: nn.Module, optimizer: Optimizer, tensors: Mapping[str, Tensor]
-) -> None:
-    """Restore a network and its optimizer from `learner_tensors`; ignore other tensors."""
+def load_learner(
+    path: Path, network: nn.Module, optimizer: Optimizer
+) -> tuple[dict[str, Tensor], Any]:
+    """Restore a network and its optimizer, and return all tensors and the state of `save_learner`.
+
+    Raises:
+        InputError: The file cannot be read, or its state is not a JSON object.
+        RuntimeError: The weights do not fit the network.
+        ValueError: The state of the optimizer does not fit the network.
+    """
+    tensors, state = load_tensors(path)
     network.load_state_dict(tensors_with_prefix(tensors, "network"))
     optimizer_state: dict[int, dict[str, Tensor]] = {}
     for key, value in tensors_with_prefix(tensors, "optimizer").items():
@@ -204,6 +224,7 @@ def restore_learner(
         optimizer_state.setdefault(int(index), {})[name] = value
     _check_optimizer_state(optimizer, optimizer_state)
     optimizer.load_state_dict(optimizer.state_dict() | {"state": optimizer_state})
+    return tensors, state
 
 
 def _check_optimizer_state(optimizer: Optimizer, state: Mapping[int, Mapping[str, Tensor]]) -> None:

@@ -14,12 +14,7 @@ from torch import Tensor
 from drake_clutter.cell.camera import Camera
 from drake_clutter.cell.support import Support
 from drake_clutter.files import InputError
-from drake_clutter.learning.checkpoint import (
-    learner_tensors,
-    load_tensors,
-    restore_learner,
-    save_tensors,
-)
+from drake_clutter.learning.checkpoint import load_learner, save_learner
 from drake_clutter.perception.depth_noise import add_depth_noise
 from drake_clutter.perception.image_dataset import LabeledImage
 from drake_clutter.perception.segmentation import (
@@ -248,10 +243,9 @@ class SegmentationLearner:
 
     def save(self, path: Path) -> None:
         """Write the state from which `load` continues the training."""
-        save_tensors(path, learner_tensors(self.network, self._optimizer), {"step": self.step})
+        save_learner(path, self.network, self._optimizer, {"step": self.step})
 
     def load(self, path: Path) -> None:
         """Continue a training of the same config and seed where `save` was called."""
-        tensors, state = load_tensors(path)
-        restore_learner(self.network, self._optimizer, tensors)
+        _, state = load_learner(path, self.network, self._optimizer)
         self.step = state["step"]
