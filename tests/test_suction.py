@@ -26,7 +26,7 @@ from drake_clutter.cell.gripper import (
     Gripper,
     LazyGrasps,
 )
-from drake_clutter.cell.lip_seal import lip_flatness_deviation, lip_surface_profile, lip_tilt
+from drake_clutter.cell.lip_seal import lip_flatness_deviation, lip_surface_profile, profile_tilt
 from drake_clutter.cell.payload_limits import DOWN_G, GRAVITY, payload_wrench
 from drake_clutter.cell.suction import (
     MAX_SEAL_GAP,
@@ -119,7 +119,8 @@ def test_tilt_and_curvature_are_told_apart() -> None:
     for degrees in (0.0, 5.0, 20.0):
         X_OG = on_top(0.115, tilt=math.radians(degrees))
         assert lip_flatness_deviation(box, X_OG, CUP.diameter) == pytest.approx(0.0, abs=1e-12)
-        assert math.degrees(lip_tilt(box, X_OG, CUP.diameter)) == pytest.approx(degrees, abs=1e-6)
+        tilt = profile_tilt(lip_surface_profile(box, X_OG, CUP.diameter), CUP.diameter)
+        assert math.degrees(tilt) == pytest.approx(degrees, abs=1e-6)
         assert SUCTION.can_attach("single", box, X_OG) is (degrees <= SUCTION.max_tilt_deg)
     side = RigidTransform(ALONG_MINUS_X, [0.033, 0.0, 0.0])
     sagitta = 0.033 - math.sqrt(0.033**2 - 0.0125**2)
@@ -321,8 +322,8 @@ def test_the_profile_of_a_mesh_is_that_of_the_box_of_its_size(tmp_path: Path) ->
     assert lip_surface_profile(own, on_top(0.045), CUP.diameter) == pytest.approx(
         np.full(24, 0.010), abs=1e-7
     )
-    tilted = lip_tilt(own, on_top(0.035, tilt=math.radians(5)), CUP.diameter)
-    assert tilted == pytest.approx(math.radians(5), rel=1e-5)
+    tilted = lip_surface_profile(own, on_top(0.035, tilt=math.radians(5)), CUP.diameter)
+    assert profile_tilt(tilted, CUP.diameter) == pytest.approx(math.radians(5), rel=1e-5)
     assert lip_flatness_deviation(own, on_top(0.035, x=0.02), CUP.diameter) == math.inf
 
 

@@ -142,7 +142,7 @@ def lip_flatness_deviation(
     """Return the deviation of the surface under the lip from a plane [m].
 
     The plane is a least-squares fit, at any tilt. Curvature, edges and gaps increase the
-    deviation; the tilt is that of `lip_tilt`.
+    deviation; the tilt is that of `profile_tilt`.
 
     Args:
         object_class: Class of the object.
@@ -153,20 +153,6 @@ def lip_flatness_deviation(
         Deviation [m]; infinite if a part of the lip has no surface below.
     """
     return profile_deviation(lip_surface_profile(object_class, X_OG, diameter), diameter)
-
-
-def lip_tilt(object_class: ObjectClass, X_OG: RigidTransform, diameter: float) -> float:
-    """Return the angle between the surface under the lip and the plane of the lip [rad].
-
-    Args:
-        object_class: Class of the object.
-        X_OG: Pose of the gripper in the object.
-        diameter: Diameter of the lip [m].
-
-    Returns:
-        Angle [rad]; NaN if a part of the lip has no surface below.
-    """
-    return profile_tilt(lip_surface_profile(object_class, X_OG, diameter), diameter)
 
 
 def _slope(profile: Floats, diameter: float) -> Floats:
@@ -229,7 +215,7 @@ def face_poses(
                 X_OG = X_TO.InvertAndCompose(X_TG)
                 if X_TG.rotation().matrix()[2, 2] > math.sin(_LEVEL_TILT):
                     continue
-            # The lip goes on until it touches a convex piece; those of a mesh may bulge.
+            # The lip advances until it touches a convex piece; those of a mesh may bulge.
             depth = _contact_depth(object_class, X_OG, diameter)
             if math.isfinite(depth):
                 X_TG = X_TG @ RigidTransform([0.0, 0.0, depth])

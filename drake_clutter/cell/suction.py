@@ -35,6 +35,7 @@ from drake_clutter.cell.gripper import (
 )
 from drake_clutter.cell.lip_seal import (
     face_poses,
+    lip_flatness_deviation,
     lip_surface_profile,
     profile_deviation,
     profile_tilt,
@@ -159,7 +160,7 @@ class SuctionGripper(StrictModel):
         if not self.can_attach(tool, object_class, X_OG):
             return math.inf
         diameter = self.cup(tool).diameter
-        deviation = profile_deviation(lip_surface_profile(object_class, X_OG, diameter), diameter)
+        deviation = lip_flatness_deviation(object_class, X_OG, diameter)
         share = deviation / self.unevenness if self.unevenness > 0 else 0.0
         return share / self.leak_time_constant
 
