@@ -69,6 +69,7 @@ ADDED = {
     "explore": ["--max-moves", "1"],
     "record": ["--max-moves", "1", "--resolution", "64x48"],
     "run": ["--set", "max_moves=1"],
+    # The other renderer and the mask images are slow; test_images.py has both.
     "render_image_dataset": ["--renderer=raster", "--compact"],
     "train_detector": [
         "--set=learning.steps=1",
