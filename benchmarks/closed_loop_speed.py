@@ -3,7 +3,7 @@
     python benchmarks/closed_loop_speed.py --count 20 --out closed_loop_speed.json
 
 Episodes of the rows of `training/evaluate_closed_loop.py` with two cups in scenes of SG* are run in
-this process. The first one is run once more before, so that no compilation and no loading counts.
+this process. The first one is run once before, so that neither compilation nor loading counts.
 The time of an episode includes building its diagram. Times mean little unless nothing else runs on
 the machine.
 """

@@ -25,7 +25,7 @@ from training.results_file import Row, provenance
 from training.script import ResultsOption, print_table, progress, run_script
 
 SCENES = "training/scenes/sg_star_25.json"
-"""Scene dataset whose graphs are laid out anew in every episode."""
+"""Scene dataset whose graphs are laid out again in every episode."""
 MOVE = "a move"
 """Name of the measurement of the environment's steps."""
 RESET = "a new scene"

@@ -8,7 +8,7 @@ Every job runs in a process that is forked for it:
 - "fresh": this process has imported the packages of others only. The forked process imports the
   software with the mutated module. This is for code that runs when a module is imported.
 
-Files are not changed, so processes that a test starts anew run the unchanged software. Times are
+Files are not changed, so new processes that a test starts run the unchanged software. Times are
 processor times, and do not depend on the load of the machine.
 
     python -m benchmarks.mutation_worker collected|fresh TEST_FILE ...

@@ -141,7 +141,7 @@ def model_row(rate: float, start: float, serial: float, workers: int) -> dict[st
         rate: Moves of a single worker per hour.
         start: Time that does not depend on the number of moves [s].
         serial: Time of the distributing process for a move [s].
-        workers: Number of workers, each with a core of its own.
+        workers: Number of workers, one per core.
     """
     seconds = start + MODEL_MOVES * (serial + 3600 / rate / workers)
     return {

@@ -4,8 +4,8 @@
 
 Random legal moves in stable scenes are planned by this checkout and simulated, in turn, by the
 baseline and by this checkout, each in a process of its own, on one core. Every move is simulated
-`REPEATS` times; the least time counts. The first move is simulated once more, so that no
-compilation counts.
+`REPEATS` times; the least time counts. The first move is simulated once before, so that
+compilation does not count.
 """
 
 import base64
@@ -47,7 +47,7 @@ def sample_moves(count: int, seed: int) -> list[str]:
         move = sample_move(number)
         plan = executor.plan(move.scene, move.command) if move else None
         if move and isinstance(plan, PickPlacePlan):
-            # Fields of earlier plans are properties of today's.
+            # Fields of plans of earlier versions, which are properties in this one.
             names |= {"tool", "X_OG", "joints_open", "joints_held", "payload"}
             values = {name: getattr(plan, name) for name in names} | {"scene": move.scene}
             encoded = {k: base64.b64encode(pickle.dumps(v)).decode() for k, v in values.items()}

@@ -227,7 +227,7 @@ def format_value(value: Any) -> str:
 
 @contextmanager
 def cli_error_handler() -> Iterator[None]:
-    """Print an error that the user can mend as one line and exit with code 2.
+    """Print an error that the user can correct as one line and exit with code 2.
 
     These are an `InputError`, files that cannot be written, and worker processes that are killed
     again and again. An interruption has a line of its own and exit code 130.

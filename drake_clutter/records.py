@@ -71,7 +71,7 @@ def partial_records(out: Path) -> Iterator[Path]:
         out: The output file.
 
     Yields:
-        Path of a record file, from which the same computation goes on after an interruption. It is
+        Path of a record file, from which the same computation resumes after an interruption. It is
         removed when the block ends without an error.
     """
     path = out.with_name(f"{out.name}.partial.jsonl")

@@ -7,7 +7,7 @@ r"""Generate a dataset of stable scenes for explorers: one JSON file.
 Every scene is stable and hides at least one object, by Drake's verdict. No scene graph is repeated,
 nor one of the sets given by `--exclude`, up to symmetry.
 
-A training set (the default) holds graphs, which an environment lays out anew in every episode. Its
+A training set (the default) holds graphs, which an environment lays out again in every episode. Its
 scenes are also stable by the static model, and can be disassembled. A test set (`--with-poses`)
 also holds the poses in which the objects came to rest.
 

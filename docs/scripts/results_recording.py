@@ -52,8 +52,8 @@ def page() -> str:
     text += table(["part", *IMAGES.values()], _share_rows(results["shares"]))
     text += (
         f"\n## More workers\n\nTime for {results['model_moves']:,} moves by a model, not by a "
-        "measurement: each worker has a core of its own and is as fast as the one that was "
-        "measured, and a single process reads all episodes for the card at the end. See "
+        "measurement: every worker runs on a separate core and is as fast as the measured "
+        "one, and a single process reads all episodes for the card at the end. See "
         "`benchmarks/recording_throughput.py`.\n\n"
     )
     text += table(

@@ -114,7 +114,7 @@ TargetOption = Annotated[
         "--target",
         metavar="CLASS|NAME|random-hidden",
         help="Search for one object: any of a class, the one of a name, or one that is drawn among "
-        "the hidden ones. The policy is told its class. Default: search for all objects.",
+        "the hidden ones. The policy knows its class. Default: search for all objects.",
     ),
 ]
 RetrieveOption = Annotated[

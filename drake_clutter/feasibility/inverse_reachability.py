@@ -388,7 +388,7 @@ def _is_reached_exactly(poses, floor, branch, arm, tops, base, gap, picked, work
             return False
         if collides_with_itself(placed, radii, pairs, gap):
             return False
-        # At the place the picked object is no longer where it was.
+        # At the place pose, the picked object has left its pick pose.
         if (point == 0 or point == 3) and collides_with_objects(
             placed, radii, base, tops, may_touch if point == 0 else ignores, picked
         ):

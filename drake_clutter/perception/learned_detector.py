@@ -50,7 +50,7 @@ MIN_MEASURED_FRACTION = 0.1
 """Smallest fraction of pixels over the support with a measured depth.
 
 The noise model of the D435 leaves at least 0.9. Below this bound an empty tray could not be
-told from a tray that is not seen.
+distinguished from a covered camera.
 """
 MIN_SCORE = 0.3
 """Smallest score of a fitted pose that may become a detection."""

@@ -89,7 +89,7 @@ class ExecutorStatus(Message):
             jaws met nothing.
         bellows_extension: Extension of the bellows before the guarded descent [m]; NaN without one.
         felt_mass: Mass that stretched the bellows [kg]; NaN without a guarded descent, or if
-            nothing hung on them.
+            the cups hold nothing.
         has_touched: Whether the guarded descent has ended by contact.
     """
 

@@ -66,8 +66,8 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
 
     With a target, an episode ends when an object of the target has been detected, which alone earns
     the `detection_reward`, and observations have two more arrays: `target_kind` and `is_target`.
-    The policy is told the class. A privileged one sees which nodes are the target. A reset samples
-    scenes in which the target is hidden.
+    The policy observes the class. A privileged one observes which nodes are the target. A reset
+    samples scenes in which the target is hidden.
 
     The `info` of a step has the `transition` (a `Transition`) if the move was allowed, and at the
     end of an episode the `termination` (a `TerminationReason`). The outcome of the transition names
