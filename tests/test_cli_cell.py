@@ -34,7 +34,6 @@ def scene_file(tmp_path: Path) -> Path:
 
 def run(*arguments: str | Path, code: int = 0) -> str:
     """Run a command, check its exit code and return what it prints."""
-| Path) -> None:
     result = CliRunner().invoke(app, [str(argument) for argument in arguments])
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
