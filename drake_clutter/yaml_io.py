@@ -1,11 +1,12 @@
 """Reading and writing YAML.
 
-In addition to YAML 1.1, 1e-3 is a number, and a duplicate key of a mapping is an error.
+Numbers are those of YAML 1.2: 1e-3 is one, 010 is ten, and 1:30 is text. A duplicate key of a
+mapping is an error. Everything else is YAML 1.1.
 """
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import yaml
 
@@ -15,12 +16,25 @@ MAX_DEPTH = 100
 """Largest depth of nested mappings and lists; libyaml overflows the stack at some ten thousand."""
 MAX_VALUES = 10**7
 """Largest number of values of a document, with those of its aliases."""
-_EXPONENT_NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$")
-"""Numbers such as 1e-3, which YAML 1.1 reads as strings."""
+_INTEGER_TAG = "tag:yaml.org,2002:int"
+_FLOAT_TAG = "tag:yaml.org,2002:float"
+_INTEGER = re.compile(r"[-+]?[0-9]+$|0x[0-9a-fA-F]+$")
+"""Integers; YAML 1.1 reads 010 as octal, and 1:30 as 90."""
+_FLOAT = re.compile(
+    r"[-+]?(\.[0-9]+|[0-9]+\.[0-9]*)([eE][-+]?[0-9]+)?$|[-+]?[0-9]+[eE][-+]?[0-9]+$"
+    r"|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$"
+)
+"""Floating-point numbers; YAML 1.1 reads 1e-3 as a string."""
 
 
 class _Loader(yaml.CSafeLoader):
-    """Loader that reads 1e-3 as a number and rejects duplicate keys."""
+    """Loader that reads the numbers of YAML 1.2 and rejects duplicate keys."""
+
+    # Without those of YAML 1.1.
+    yaml_implicit_resolvers: ClassVar[dict[str, list[tuple[str, Any]]]] = {
+        first: [(tag, text) for tag, text in known if tag not in (_INTEGER_TAG, _FLOAT_TAG)]
+        for first, known in yaml.CSafeLoader.yaml_implicit_resolvers.items()
+    }
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         own_items = node.value  # without the items of a merge key
@@ -38,6 +52,10 @@ class _Loader(yaml.CSafeLoader):
     def construct_whole_mapping(self, node: yaml.MappingNode) -> dict[Any, Any]:
         return self.construct_mapping(node, deep=True)
 
+    def construct_integer(self, node: yaml.ScalarNode) -> int:
+        text = str(node.value)
+        return int(text, 16) if text.startswith("0x") else int(text)
+
     def construct_whole_sequence(self, node: yaml.SequenceNode) -> list[Any]:
         return list(self.construct_sequence(node, deep=True))
 
@@ -49,8 +67,10 @@ class _Dumper(yaml.CSafeDumper):
 # Containers are constructed at once, so that one that contains itself is an error.
 _Loader.add_constructor("tag:yaml.org,2002:map", _Loader.construct_whole_mapping)
 _Loader.add_constructor("tag:yaml.org,2002:seq", _Loader.construct_whole_sequence)
+_Loader.add_constructor(_INTEGER_TAG, _Loader.construct_integer)
 for _kind in (_Loader, _Dumper):
-    _kind.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT_NUMBER, list("-+.0123456789"))
+    _kind.add_implicit_resolver(_INTEGER_TAG, _INTEGER, list("-+0123456789"))
+    _kind.add_implicit_resolver(_FLOAT_TAG, _FLOAT, list("-+.0123456789"))
 
 
 def to_yaml(document: Any, width: int = 160) -> str:

@@ -105,7 +105,7 @@ def test_flat_actions_are_the_same_moves() -> None:
         np.testing.assert_array_equal(value, steps[1][0][name])
 
 
-@pytest.mark.parametrize("action", [-1, 30, 1.5, "a", None, True, [1, 2], np.nan])
+@pytest.mark.parametrize("action", [-1, 30, 1.5, "a", None, True, np.True_, [1, 2], np.nan])
 def test_an_odd_rule_is_refused(action: Any, generation: ClutterGeneration) -> None:
     with pytest.raises(ValueError, match=r"^action: .*; expected an integer in \[0, 29\]$"):
         generation.step(action)
@@ -190,3 +190,30 @@ def test_a_set_of_many_classes_has_numbers_above_127() -> None:
 def test_too_many_objects_are_refused() -> None:
     with pytest.raises(InputError, match=r"max_objects: 70000; expected 1 to 200"):
         ClutterExploration(max_objects=70_000)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"task": {"nodes": 3}}, r"task: \{'nodes': 3\}; expected a GenerationTaskConfig or None"),
+        ({"config": "tray"}, "config: 'tray'; expected a ClutterConfig or None"),
+        ({"classes": []}, r"classes: \[\]; expected some ObjectClass"),
+        ({"classes": ["mug"]}, r"classes: \['mug'\]; expected some ObjectClass"),
+    ],
+)
+def test_odd_arguments_of_generation_are_refused(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=f"^{message}$"):
+        gymnasium.make(f"drake_clutter.tasks:{GENERATION}", **arguments)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        *({"max_moves": -1}, {"max_moves": 1.5}, {"flat_actions": "yes"}, {"privileged": 1}),
+        {"config": {"settle": {}}},
+    ],
+)
+def test_odd_arguments_of_exploration_are_refused(arguments: dict[str, Any]) -> None:
+    (name,) = arguments
+    with pytest.raises(InputError, match=f"^{name}: .*; expected "):
+        gymnasium.make(f"drake_clutter.tasks:{EXPLORATION}", **arguments)

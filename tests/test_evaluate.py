@@ -114,7 +114,9 @@ def test_scenes_are_evaluated_in_their_own_cell(tmp_path: Path) -> None:
         folder.mkdir()
         verdict = Verdict(None, scene.poses, dict.fromkeys(scene.names, 0.0), scene.names)
         save_scene(folder / f"{number}.yaml", scene, cell, verdict)
-        assert common_cell(load_evaluation_scenes(str(folder), None)) == cell
+        (loaded,) = load_evaluation_scenes(str(folder), None)
+        assert load_evaluation_scenes(str(folder / f"{number}.yaml"), None) == [loaded]
+        assert common_cell([loaded]) == cell
         out = folder / "out.json"
         command = [
             "evaluate",

@@ -1,6 +1,7 @@
 """Validation errors are one short line: the file, the field, the value and what is allowed."""
 
 import importlib
+import math
 from collections.abc import Iterator
 from dataclasses import field
 from pathlib import Path
@@ -281,6 +282,21 @@ def test_numbers_with_an_exponent_are_numbers() -> None:
     texts = ["1e-3", "e3", "1e", "1e3x", "1e-05", "-1E5", "yes", "12", "1:30", "", "a: b", "ö"]
     assert parse_yaml(to_yaml(texts), "") == texts
     assert parse_yaml("[e3, 1e, 1e3x, '1e3']", "") == ["e3", "1e", "1e3x", "1e3"]
+
+
+def test_numbers_are_those_of_yaml_1_2() -> None:
+    """YAML 1.1 reads 010 as 8, 1:30 as 90 and 1_000 as 1000."""
+    text = "[010, -7, +012, 0x1F, 0.5, 5., .5, -.inf]"
+    assert parse_yaml(text, "") == [10, -7, 12, 31, 0.5, 5.0, 0.5, -math.inf]
+    texts = ["1:30", "1:30.5", "1_000", "0b11", "1.5_0", "0x", "-", "+.e3"]
+    assert parse_yaml(f"[{', '.join(texts)}]", "") == texts
+    assert parse_yaml(to_yaml([*texts, "010", 10, -0.0, 1e22]), "") == [
+        *texts,
+        "010",
+        10,
+        0.0,
+        1e22,
+    ]
 
 
 def test_merge_keys_may_override() -> None:

@@ -40,8 +40,8 @@ def evaluate(
     scenes: Annotated[
         str | None,
         typer.Option(
-            help="Shipped scene dataset, such as sg_star_25; scene dataset file; or folder of "
-            "scene files with verdicts, such as the `scenes` folder that `generate` writes."
+            help="Shipped scene dataset, such as sg_star_25; scene dataset file; scene file with "
+            "verdict, or folder of them, such as the `scenes` folder that `generate` writes."
         ),
     ] = None,
     agents: Annotated[

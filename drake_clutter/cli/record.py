@@ -56,8 +56,8 @@ def record(
     scenes: Annotated[
         str,
         typer.Option(
-            help="Folder of scene files; shipped scene dataset, such as sg_star_25; scene dataset "
-            "file; or scene generator, as for `generate --agent`."
+            help="Scene file or folder of them; shipped scene dataset, such as sg_star_25; scene "
+            "dataset file; or scene generator, as for `generate --agent`."
         ),
     ],
     out: OutOption,

@@ -58,10 +58,11 @@ class EvaluationScene:
 def load_evaluation_scenes(
     source: str, catalog_folder: Path | None, *, with_hidden_objects: bool = True
 ) -> list[EvaluationScene]:
-    """Return the scenes of a folder or a scene dataset.
+    """Return the scenes of a folder, a scene file, or a scene dataset.
 
     Args:
-        source: Folder of scene files, scene dataset file, or name of a shipped scene dataset.
+        source: Folder of scene files, scene file (.yaml), scene dataset file, or name of a shipped
+            scene dataset.
         catalog_folder: Asset folder with the user's object classes, or None.
         with_hidden_objects: Whether scene files are left out that are not stable with hidden
             objects. Otherwise those are left out that a judge has found not to be stable.
@@ -81,14 +82,15 @@ def load_evaluation_scenes(
             allowed = f"a folder, a file, and {', '.join(sorted(sets))}"
             raise InputError(f"--scenes {source}: does not exist; expected {allowed}")
         scenes = sets[source]
-    if scenes.is_file():
+    is_scene_file = scenes.is_file() and scenes.suffix in (".yaml", ".yml")
+    if scenes.is_file() and not is_scene_file:
         dataset = load_scene_dataset(scenes, catalog)
         classes = frozenset(c.name for c in dataset.classes)
         return [
             EvaluationScene(scenes, number, classes, dataset.cell, len(scene.settled_poses or ()))
             for number, scene in enumerate(dataset.scenes)
         ]
-    paths = sorted(scenes.glob("*.yaml"))
+    paths = [scenes] if is_scene_file else sorted(scenes.glob("*.yaml"))
     if not paths:
         raise InputError(
             f"{scenes}: holds no scene files (*.yaml); give the `scenes` folder that `generate` "

@@ -20,6 +20,7 @@ from drake_clutter.tasks.belief import Decision
 from drake_clutter.tasks.environment_interface import (
     RENDER_METADATA,
     check_index,
+    check_instance,
     check_is_reset,
     check_render_mode,
     check_reset_options,
@@ -37,6 +38,7 @@ from drake_clutter.tasks.exploration_graph import (
 )
 from drake_clutter.tasks.exploration_task import ExplorationTask, MoveAttempt, TerminationReason
 from drake_clutter.tasks.search_target import SearchTarget, find_target, missing_target_error
+from drake_clutter.validation import Count, Flag, validate
 
 DEFAULT_SCENES = "training/scenes/train_sg_star.json"
 """Scene dataset of the environment by default."""
@@ -106,10 +108,15 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
                 objects.
 
         Raises:
-            InputError: There is no such file, fidelity or render mode, or `max_objects` is not
+            InputError: There is no such file, fidelity or render mode, or another argument is not
                 allowed.
         """
         self.render_mode = check_render_mode(render_mode)
+        check_instance(config, ClutterConfig, "config")
+        if max_moves is not None:
+            validate(Count, max_moves, "max_moves")
+        validate(Flag, privileged, "privileged")
+        validate(Flag, flat_actions, "flat_actions")
         if not 1 <= max_objects <= MAX_NODES:
             raise InputError(f"max_objects: {max_objects}; expected 1 to {MAX_NODES}")
         if not isinstance(scenes, SceneDataset):

@@ -2,7 +2,7 @@
 
 import operator
 from collections.abc import Collection, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from gymnasium.error import ResetNeeded
@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from drake_clutter.config import ClutterConfig
 from drake_clutter.files import InputError, format_value
 from drake_clutter.scenes.scene import Scene
+
+Kind = TypeVar("Kind")
 
 RENDER_METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 1}
 """Metadata of the environments for gymnasium: render modes, and pictures per second of a video."""
@@ -25,6 +27,22 @@ def check_render_mode(render_mode: str | None) -> str | None:
     if render_mode not in (None, *RENDER_METADATA["render_modes"]):
         raise InputError(f"render_mode: {format_value(render_mode)}; expected 'rgb_array' or None")
     return render_mode
+
+
+def check_instance(value: Kind | None, kind: type[Kind], name: str) -> Kind | None:
+    """Return an argument that is of a kind or None.
+
+    Args:
+        value: The argument.
+        kind: The kind.
+        name: Name of the argument.
+
+    Raises:
+        InputError: It is something else, such as a dict.
+    """
+    if value is not None and not isinstance(value, kind):
+        raise InputError(f"{name}: {format_value(value)}; expected a {kind.__name__} or None")
+    return value
 
 
 def check_reset_options(
@@ -81,7 +99,8 @@ def check_index(value: Any, count: int, name: str) -> int:
         InputError: The value is not such an integer.
     """
     try:
-        index = operator.index(value.item() if np.shape(value) in ((), (1,)) else value)
+        scalar = value.item() if np.shape(value) in ((), (1,)) else value
+        index = scalar if isinstance(scalar, bool) else operator.index(scalar)
     except AttributeError:  # an integer of Python
         index = value
     except TypeError:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from drake_clutter.catalog import ObjectClass, load_catalog
 from drake_clutter.config import ClutterConfig
+from drake_clutter.files import InputError, format_value
 from drake_clutter.grammar import ClutterGraph, Derivation, NodeBudget, Orientation, SceneGrammar
 from drake_clutter.grammar.clutter_graph import (
     DUMMY,
@@ -32,6 +33,7 @@ from drake_clutter.stability.static_judge import StaticStabilityJudge
 from drake_clutter.tasks.environment_interface import (
     RENDER_METADATA,
     check_index,
+    check_instance,
     check_is_reset,
     check_render_mode,
     check_reset_options,
@@ -373,12 +375,16 @@ class ClutterGeneration(gymnasium.Env[GenerationObservation, int]):
             render_mode: "rgb_array" for pictures, or None.
 
         Raises:
-            InputError: There is no such render mode.
+            InputError: There is no such render mode, or another argument is of the wrong kind.
         """
         self.render_mode = check_render_mode(render_mode)
-        self.task = task or GenerationTaskConfig()
-        self._config = config or ClutterConfig()
-        self.grammar = SceneGrammar(classes or load_catalog().object_set("ycb7"))
+        self.task = check_instance(task, GenerationTaskConfig, "task") or GenerationTaskConfig()
+        self._config = check_instance(config, ClutterConfig, "config") or ClutterConfig()
+        if classes is None:
+            classes = load_catalog().object_set("ycb7")
+        if not classes or not all(isinstance(c, ObjectClass) for c in classes):
+            raise InputError(f"classes: {format_value(classes)}; expected some ObjectClass")
+        self.grammar = SceneGrammar(classes)
         self.vocabulary = GraphVocabulary.from_grammar(self.grammar)
         self._judge = StaticStabilityJudge(self._config, margin=self.task.contact_margin)
         n = self.task.nodes
