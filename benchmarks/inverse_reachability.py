@@ -28,9 +28,9 @@ from drake_clutter.feasibility.arm_clearance import ObstacleTops
 from drake_clutter.feasibility.base_search import BaseGrid, find_reachable_moves
 from drake_clutter.feasibility.inverse_reachability import (
     InverseReachabilityMap,
-    MovePoses,
     build_inverse_reachability,
 )
+from drake_clutter.feasibility.move_poses import MovePoses
 from drake_clutter.feasibility.move_study import find_legal_moves
 from drake_clutter.feasibility.setups import Setup, SetupRequest, prepare_setup
 from drake_clutter.perception.label_detector import LabelDetector

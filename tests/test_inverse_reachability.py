@@ -10,6 +10,8 @@ import pytest
 from conftest import DEFAULT_CELL, cell_with, resting, rng, scene_of
 from numpy.typing import NDArray
 
+from drake_clutter.cell.work_cell import load_cell
+from drake_clutter.feasibility import inverse_reachability
 from drake_clutter.feasibility.arm_clearance import (
     ArmGeometry,
     ObstacleTops,
@@ -18,14 +20,14 @@ from drake_clutter.feasibility.arm_clearance import (
     place_capsules,
 )
 from drake_clutter.feasibility.inverse_reachability import (
-    SPACING,
     InverseReachabilityMap,
-    MovePoses,
     _dilate,
-    find_move_poses,
+    build_inverse_reachability,
     load_inverse_reachability,
     save_inverse_reachability,
 )
+from drake_clutter.feasibility.move_poses import MovePoses, find_move_poses
+from drake_clutter.feasibility.reachability_query import SPACING
 from drake_clutter.files import InputError
 from drake_clutter.grammar.orientation import Orientation
 from drake_clutter.planning.collision_model import CollisionModel
@@ -33,6 +35,8 @@ from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailur
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics, downward_pose
+from drake_clutter.resources import resource_path
+from drake_clutter.robots.serial_chain import chain_frames
 from drake_clutter.scenes.scene import Pose
 
 Floats = NDArray[np.float64]
@@ -206,6 +210,81 @@ def test_exact_poses_agree_with_the_planner() -> None:
         turned = [[*base[:3], 1.0]]
         assert reaches(tools, moves, turned, table, tops) == [True], "the first joint turns back"
         assert reaches(tools, moves, [base], 0.2, tops) == [False], "the grasp is below the table"
+
+
+def test_the_tool_tells_where_the_last_joint_is() -> None:
+    arm = Arm()
+    q = rng(4).uniform(-math.pi, math.pi, 6)
+    fixed = arm.geometry.fixed
+    frames, moved = np.empty((7, 4, 4)), np.empty((6, 3, 4))
+    chain_frames(fixed, np.ones(6, bool), q, frames, moved)
+    X_TJ = arm.tool.pose(q) @ arm.geometry.X_GJ
+    X_TB = arm.cell.robot.X_TB.GetAsMatrix4()
+    assert np.linalg.inv(X_TB) @ X_TJ == pytest.approx(np.vstack([moved[5], [0, 0, 0, 1]]))
+    assert ArmGeometry.without_closed_form().X_GJ.shape == (0, 4)
+
+
+def test_rows_are_tried_in_any_order() -> None:
+    """A base that only the last of three grasps serves comes between others."""
+    moves = [move_rows((x, 0.0, 0.1), (x, 0.1, 0.2), 0.4) for x in (3.0, 0.3, 6.0)]
+    joined = MovePoses.join(moves)
+    one = replace(joined, starts=np.array([0, 3, 3]), picked=np.array([0, 0]))
+    bases = np.array([[x, 0.0, 0.0, 0.0] for x in (0.0, 6.0, 3.0, -1.0, 6.0, 0.0)])
+    found = disk_map(0.45).find_reachable(one, bases, -1.0, NO_TOPS)
+    assert found[:, 0].tolist() == [True, True, True, False, True, True]
+    assert not found[:, 1].any(), "a move without grasps"
+
+
+def test_the_map_agrees_with_inverse_kinematics(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A base reaches a move where one branch solves all points; random bases, real map.
+
+    The bounds differ where a link is within 1 cm of what it must not touch.
+    """
+    monkeypatch.setattr(inverse_reachability, "NUM_YAWS", 6)
+    cell = load_cell(resource_path("models/cells/ur3e_epick_tray.yaml"))
+    name = next(iter(cell.gripper.tools))
+    reachability = build_inverse_reachability(cell, name)
+    far = cell.robot.base.model_copy(update={"translation": (-50.0, 0.0, 2.0)})
+    apart = cell.model_copy(
+        update={"robot": cell.robot.model_copy(update={"base": far}), "fixtures": ()}
+    )
+    tool, model = ToolKinematics(apart, name), CollisionModel(apart, ())
+    X_TB_apart = apart.robot.X_TB.GetAsMatrix4()
+    down = move_rows((0.0, 0.0, 0.1), (0.1, 0.15, 0.2), 0.3)
+    to_x = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    ends = down.ends.copy()
+    ends[..., :3, :3] = to_x
+    side = replace(down, ends=ends, yaws=np.full((1, 2), math.nan))
+    tops = ObstacleTops.from_scene(scene_of(), reachability.arm.radii)
+    none = np.full_like(tops.first, -math.inf)
+    nothing = replace(tops, first=none, second=none, highest=none.max(axis=(1, 2)))
+    num_reached, num_sure = 0, 0
+    bases = rng(5).uniform((-0.5, -0.3, 0.0, -math.pi), (0.3, 0.5, 0.6, math.pi), (40, 4))
+    for moves in (down, side):
+        floor = 0.0 if moves is side else -2.0
+        above = moves.ends[0].copy()
+        above[:, 2, 3] = moves.heights[0]
+        points = np.array([moves.ends[0, 0], above[0], above[1], moves.ends[0, 1]])
+        found = reaches(reachability, moves, bases.tolist(), -2.0, nothing)
+        for base, is_found in zip(bases, found, strict=True):
+            X_TB = downward_pose(base[3], base[:3])
+            X_TB[:3, 1:3] *= -1  # upright
+            q = tool.solve_ik(X_TB_apart @ np.linalg.inv(X_TB) @ points).swapaxes(0, 1)
+            q = q[np.isfinite(q).all(axis=(1, 2))]
+            change = (q[:, 2] - q[:, 1] + math.pi) % (2 * math.pi) - math.pi
+            q = np.concatenate([q, (q[:, 1] + change / 2)[:, None]], axis=1)
+            height = 2.0 - base[2]
+            clear = [
+                not len(model.distances_along(branch, 0.015).rows)
+                and model.lowest_points(branch).min() - height > floor + 0.015
+                for branch in q
+            ]
+            assert any(clear) <= is_found <= bool(len(q)), base
+            num_reached += is_found
+            num_sure += any(clear) == bool(len(q))
+
+    assert 15 < num_reached < 60
+    assert num_sure > 60
 
 
 def test_dilated_maps_have_the_bits_of_neighbors() -> None:

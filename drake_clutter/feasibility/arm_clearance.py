@@ -7,7 +7,7 @@ joint, 0 and 6 are Denavit-Hartenberg frames of the UR family.
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,8 @@ from drake_clutter.compilation import njit
 from drake_clutter.planning.collision_model import CollisionModel
 from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.robots.inverse_kinematics import UrInverseKinematics
-from drake_clutter.robots.serial_chain import chain_frames
+from drake_clutter.robots.serial_chain import SerialChain, chain_frames
+from drake_clutter.robots.ur_kinematics import UR10_PARAMETERS, forward_kinematics
 from drake_clutter.scenes.scene import Scene
 
 Floats = NDArray[np.float64]
@@ -77,6 +78,22 @@ class ArmGeometry:
     def is_exact(self) -> bool:
         """Whether the arm has inverse kinematics in closed form."""
         return len(self.limits) > 0
+
+    @property
+    def X_GJ(self) -> Floats:
+        """Pose of the last joint's frame in the tool; empty for other arms. Shape (4, 4)."""
+        if not self.is_exact:
+            return np.empty((0, 4))
+        d1, a2, a3, d4, d5, d6 = self.lengths.tolist()
+        parameters = replace(
+            UR10_PARAMETERS, a=(0.0, a2, a3, 0.0, 0.0, 0.0), d=(d1, 0.0, 0.0, d4, d5, d6)
+        )
+        zero = np.zeros(len(self.limits))
+        chain = SerialChain(self.fixed, np.ones(len(zero), bool))
+        X_6B = np.linalg.inv(forward_kinematics(zero, parameters)) @ self.X_0B
+        return np.asarray(
+            self.X_G6 @ X_6B @ chain.forward_kinematics(zero) @ np.linalg.inv(self.fixed[-1])
+        )
 
     @staticmethod
     def from_model(

@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 
 from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.feasibility.arm_clearance import ObstacleTops
-from drake_clutter.feasibility.inverse_reachability import (
-    InverseReachabilityMap,
-    find_move_poses,
-)
+from drake_clutter.feasibility.inverse_reachability import InverseReachabilityMap
+from drake_clutter.feasibility.move_poses import find_move_poses
 from drake_clutter.feasibility.move_study import LegalMove
 from drake_clutter.feasibility.setups import Sweep
 from drake_clutter.files import input_error
