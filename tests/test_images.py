@@ -481,7 +481,7 @@ def test_colors_of_instances() -> None:
 
 
 def test_stacks_are_turned_about_themselves() -> None:
-    script = training_script("render_image_dataset")
+    script = training_script("scene_dismantling")
     below = resting("cracker_box", xy=(0.0, 0.0), name="below")
     above = resting("gelatin_box", xy=(0.0, 0.0), name="above")
     above = replace(above, X_TO=Pose((0.0, 0.0, below.top_height + above.X_TO.p[2])))
@@ -502,7 +502,7 @@ def test_stacks_are_turned_about_themselves() -> None:
 
 
 def test_objects_are_put_on_others() -> None:
-    script = training_script("render_image_dataset")
+    script = training_script("scene_dismantling")
     box = resting("cracker_box", name="box")
     can = resting("tomato_soup_can", xy=(0.2, 0.2), name="can")
     for seed in range(5):
