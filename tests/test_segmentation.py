@@ -17,9 +17,7 @@ from drake_clutter.perception.segmentation import (
     SegmentationNetwork,
     backproject_window,
     class_weights,
-    cluster_votes,
     downsample,
-    extract_segments,
     make_network_input,
     segmentation_loss,
 )
@@ -28,6 +26,7 @@ from drake_clutter.perception.segmentation_training import (
     SegmentationLearner,
     make_example,
 )
+from drake_clutter.perception.vote_segments import cluster_votes, extract_segments
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.scene import Pose
 from drake_clutter.systems.scenario import PRETRAINED_DETECTORS

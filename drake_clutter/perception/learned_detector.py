@@ -33,15 +33,14 @@ from drake_clutter.perception.pose_selection import (
 )
 from drake_clutter.perception.segmentation import (
     ImageWindow,
-    Segment,
     SegmentationNetwork,
     backproject_window,
     downsample,
-    extract_segments,
     fill_holes,
     make_network_input,
     upsample,
 )
+from drake_clutter.perception.vote_segments import Segment, extract_segments
 from drake_clutter.scenes.geometry import penetration_depth
 from drake_clutter.scenes.interfaces import Detection, Observation
 from drake_clutter.scenes.scene import Pose, SceneObject
