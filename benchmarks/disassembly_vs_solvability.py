@@ -3,8 +3,8 @@
     drake-clutter generate --agent sg-star --count 100 --seed 1000 --out out/scenes
     python benchmarks/disassembly_vs_solvability.py out/scenes --out disassembly.json
 
-The generators' reward asks that a scene can be disassembled from the top, which is cheap to test. A
-scene is solvable if the oracle search reveals all objects.
+The generators' reward requires that a scene can be disassembled from the top, which is cheap to
+test. A scene is solvable if the oracle search reveals all objects.
 """
 
 from collections import Counter

@@ -177,7 +177,7 @@ def sample_cases(count: int, seed: int) -> list[Case]:
 
 
 def sample_half_stable(size: SceneSize, count: int, seed: int) -> tuple[list[Case], float]:
-    """Return scenes of a size, stable and unstable in turn by the static model.
+    """Return scenes of a size, alternately stable and unstable by the static model.
 
     Args:
         size: The size.

@@ -46,7 +46,7 @@ null for all of the files; `test_limit`: time limit of other tests [s]; `time_li
 Result = dict[str, Any]
 """Fields: `outcomes`: outcome and time [s] by test; `lines` executed, by file and test, where an
 empty name stands for imports; `is_too_slow` if a test or the process was stopped; `failure` of a
-process that ended without outcomes; `error` of this program, which says nothing on the mutant."""
+process that ended without outcomes; `error` of this program, which is no result of the mutant."""
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = (

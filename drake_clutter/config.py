@@ -179,7 +179,7 @@ class ExplorationConfig:
             camera sees [m].
         release_height: Height above its support at which an object is released [m].
         placement: What is not known of the objects that are to carry another one.
-        belief: When a policy that stops by itself takes every object for known.
+        belief: When a policy that stops by itself considers every object known.
     """
 
     max_moves: Count = 10

@@ -84,7 +84,7 @@ NUM_STACK_HEIGHT_BINS = 10
 
 
 def verdict_name(verdict: Instability | InconclusiveVerdict | None) -> str:
-    """Return a judge's verdict as it is named in results files.
+    """Return the name of a judge's verdict in results files.
 
     Args:
         verdict: How the scene is unstable; None if it is stable.

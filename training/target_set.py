@@ -28,7 +28,7 @@ TARGETS = ROOT / "training/targets"
 
 
 class TargetPair(StrictModel):
-    """A scene and the object that is looked for in it.
+    """A scene and the target of a search in it.
 
     Attributes:
         scene: Index of the scene in the dataset.

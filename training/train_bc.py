@@ -10,7 +10,7 @@ neighbors rise above it, from the state of the scene or from the overhead depth 
 of the object. Its action is a waypoint: the change of the joint angles within `LOOKAHEAD`.
 Demonstrations are the recorded commands between home and the grasp. States next to them are
 sampled, too, and lead to the same waypoints, so that the policy returns to its way. The angle of
-the last joint, about the cup's axis, is left as it is.
+the last joint, about the cup's axis, is not changed.
 
 Frames: T is the support, G is the tool, z out of it, O is the picked object.
 """

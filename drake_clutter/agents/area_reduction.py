@@ -238,7 +238,7 @@ class AreaReductionExplorer:
         """Create the policy.
 
         Args:
-            target: Class of the object that is looked for.
+            target: Class of the target.
             config: Clearances of placements.
         """
         self._target = target

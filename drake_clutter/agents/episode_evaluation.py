@@ -34,7 +34,7 @@ class EpisodeSpec:
         scene_index: Index of the scene in the dataset; None for a scene file.
         agent: See `make_policy_factory`.
         index: Index of the episode, from which its random generator is seeded.
-        target: What the episode looks for, see `find_target`; "" for all objects.
+        target: Target of the search, see `find_target`; "" for all objects.
     """
 
     file: Path

@@ -91,7 +91,7 @@ class OracleExplorer:
         Args:
             backend: Backend of the episode, whose true scene the search uses.
             search: Searches for plans.
-            target: What the episode looks for; None for all objects.
+            target: Target of the search; None for all objects.
         """
         self._targets = frozenset[str]() if target is None else target.names
         self._backend = backend
@@ -133,7 +133,7 @@ class PolicyFactory(Protocol):
 
         Args:
             backend: Backend of the episode, whose true scene a privileged policy observes.
-            target: What the episode looks for; None for all objects.
+            target: Target of the search; None for all objects.
         """
 
 

@@ -136,7 +136,7 @@ class LearnedExplorer:
             config: Clearances of placements.
             backend: Backend of the episode, whose true scene a privileged policy observes; None for
                 a policy that observes K_t.
-            target: What a policy that is conditioned on a target looks for.
+            target: Target of a policy that is conditioned on one; None for other policies.
         """
         self._network = network
         self._node_kind_ids = node_kind_ids
@@ -232,7 +232,7 @@ class LearnedExplorerFactory:
 
         Args:
             backend: Backend of the episode.
-            target: What the episode looks for; None for all objects.
+            target: Target of the search; None for all objects.
 
         Raises:
             InputError: The policy was not trained with the class of the target, or needs a target.

@@ -35,9 +35,9 @@ def handover_move(detection: Detection, cell: WorkCell, release_height: float) -
 
 
 class RetrievingExplorer:
-    """Search policy that puts the target on the hand-over place as soon as it is in view.
+    """Search policy that moves the target to the hand-over place as soon as it is in view.
 
-    Objects that rest on the target are put on the tray first.
+    Objects that rest on the target are moved to the tray first.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class RetrievingExplorer:
 
         Args:
             search: Policy while the target is not in view.
-            target: What is looked for.
+            target: Target of the search.
             cell: Work cell with a hand-over place.
             config: Release height and clearances.
         """

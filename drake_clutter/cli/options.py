@@ -121,7 +121,7 @@ RetrieveOption = Annotated[
     bool,
     typer.Option(
         "--retrieve",
-        help="When the target is seen, put it on the hand-over place of the cell.",
+        help="When the target is seen, move it to the hand-over place of the cell.",
     ),
 ]
 WorkersOption = Annotated[

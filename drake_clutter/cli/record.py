@@ -73,7 +73,7 @@ def record(
         typer.Option(
             min=1,
             max=MAX_COUNT,
-            help="Number of episodes, which go through the scenes again and again.",
+            help="Number of episodes; they repeat the scenes in their order.",
         ),
     ] = 100,
     format: Annotated[

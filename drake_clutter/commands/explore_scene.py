@@ -100,8 +100,8 @@ def explore_scene(
         seed: Seed of the policy and the simulation.
         config: Configuration.
         on_transition: Called after each move.
-        target_text: What is looked for, see `find_target`; "" for all objects.
-        retrieve: Whether the target is put on the hand-over place of the cell when it is seen.
+        target_text: Target of the search, see `find_target`; "" for all objects.
+        retrieve: Whether the target is moved to the hand-over place of the cell when it is seen.
         until: When an episode without a target ends.
         classes: Classes of the objects that there may be, for `StopCriterion.BELIEF`.
 
@@ -291,7 +291,7 @@ def read_moves(path: Path) -> list[Move]:
 
 
 def target_to_dict(task: ExplorationTask) -> dict[str, Any]:
-    """Return what an episode looked for, and which of its objects were found."""
+    """Return the target of an episode, and which of its objects were found."""
     assert task.target is not None
     names = sorted(task.target.names)
     return {

@@ -187,7 +187,7 @@ class TrainingRun:
         return f"{rate:.3g} steps/s, {left}"
 
     def report_progress(self) -> None:
-        """Print steps, speed and time left, after the first iteration and then now and again."""
+        """Print steps, speed and time left, after the first iteration and then periodically."""
         now = time.monotonic()
         if self._has_printed and now - self._last_print < PROGRESS_PERIOD:
             return

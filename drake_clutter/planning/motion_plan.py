@@ -182,7 +182,7 @@ class MotionPlan:
 
 
 def plan_from_steps(start: CellState, steps: Sequence[PlanStep]) -> MotionPlan:
-    """Return a plan of steps of one's own, which are not checked for collisions and limits.
+    """Return a plan of user-defined steps, which are not checked for collisions and limits.
 
     Args:
         start: State at the start.

@@ -254,7 +254,7 @@ class MoveFinder:
     def _check_endpoints(
         self, state: CellState, goal: MoveGoal, model: CollisionModel
     ) -> PlanningFailure | None:
-        """Return why a motion cannot start or end as it is asked for."""
+        """Return why a motion cannot start or end as requested."""
         if failure := self._check_start(state):
             return failure
         if goal.end is not None and (failure := check_joint_limits(self.robot, goal.end, "end")):

@@ -316,7 +316,7 @@ class PickPlacePlanner:
     def make_grasp(
         self, picked: SceneObject, tool: str, X_OG: RigidTransform
     ) -> Grasp | PlanningFailure:
-        """Return a grasp of one's own, or the reason why the tool cannot hold the object with it.
+        """Return a user-defined grasp, or the reason why the tool cannot hold the object with it.
 
         Args:
             picked: Object at its pose.

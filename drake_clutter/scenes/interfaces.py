@@ -207,7 +207,7 @@ class MoveResult(Enum):
 
     Attributes:
         PLACED: The object is at its placement, and the scene is stable.
-        CAME_OFF: The gripper lost the object, which is at its placement all the same, and the scene
+        CAME_OFF: The gripper lost the object, which is at its placement anyway, and the scene
             is stable.
         COLLAPSED: The scene is unstable after the move.
         LEFT_TRAY: An object fell off the support.

@@ -276,7 +276,7 @@ class ClutterExploration(gymnasium.Env[ExplorationObservation, Any]):
         )
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Return which actions are allowed, as sb3-contrib asks for it.
+        """Return which actions are allowed, as sb3-contrib requires.
 
         Returns:
             With flat actions, the mask of the pairs. Shape (N * N,). Otherwise the masks of x and

@@ -75,8 +75,8 @@ class GenerationTaskConfig:
             `MAX_BALANCED_STACK_FRACTION` of the objects. It is not part of Kumar et al. 2022.
         instability_reward: Reward w_s of a scene that is unstable, cannot be laid out, or whose
             verdict is inconclusive.
-        require_disassembly: Whether a stack counts as unstable if it cannot be taken apart from the
-            top, object by object.
+        require_disassembly: Whether a stack counts as unstable if it cannot be disassembled from
+            the top, object by object.
         contact_margin: Distance by which the static stability judge shrinks contacts [m]. Above the
             random offsets of poses, so that simulations in Drake agree with the judge.
     """
@@ -422,7 +422,7 @@ class ClutterGeneration(gymnasium.Env[GenerationObservation, int]):
         return self.partial.observe(), self._info()
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Return which rules are feasible, as sb3-contrib asks for it. Shape (number of rules,).
+        """Return which rules are feasible, as sb3-contrib requires. Shape (number of rules,).
 
         Raises:
             gymnasium.error.ResetNeeded: There is no episode.

@@ -42,7 +42,7 @@ class SearchResult:
     """Result of an oracle search, according to the static stability judge.
 
     Attributes:
-        solvability: Whether a plan exists, as far as it is known within the budget.
+        solvability: Whether a plan exists, if the budget suffices to decide it.
         plan: Moves that reveal every object, or the target, without a collapse; empty unless
             solvable.
         lower_bound: Number of moves below which no plan exists.

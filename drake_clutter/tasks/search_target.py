@@ -16,14 +16,14 @@ RANDOM_HIDDEN = "random-hidden"
 
 @dataclass(frozen=True)
 class SearchTarget:
-    """What a search looks for.
+    """Target of a search.
 
     Policies that search know the class. The names are ground truth, for the evaluation and for
     privileged policies.
 
     Attributes:
         text: The target as it was given: a class, the name of an object, or `RANDOM_HIDDEN`.
-        object_class: Class that the policy looks for.
+        object_class: Class of the target, which the policy knows.
         names: Names of the objects of which one must be revealed.
     """
 
