@@ -170,6 +170,10 @@ TESTS_OF_COMPILED_CODE = (
     "load_check",
     "planner_robots",
     "pick_place_planner",
+    "carry_clearance",
+    "place_check",
+    "motion_plans",
+    "trajectory_optimization",
 )
 """Test files that reach the modules with compiled functions."""
 COMPILED = "import njit"

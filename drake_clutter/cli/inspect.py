@@ -6,7 +6,13 @@ from typing import Annotated
 import typer
 
 from drake_clutter.cli.options import CatalogOption, JsonOption
-from drake_clutter.cli.output import print_line, print_result, progress_bar, writing_file
+from drake_clutter.cli.output import (
+    locked_files,
+    print_line,
+    print_result,
+    progress_bar,
+    writing_file,
+)
 
 MAX_LINES = 20
 """Number of outliers and of problems that are printed."""
@@ -46,18 +52,19 @@ def inspect(
     from drake_clutter.reports.dataset_figures import plot_dataset
 
     files = find_episode_files(dataset)
-    inspection = inspect_files(
-        progress_bar("episodes", files, 0, len(files)), load_catalog(catalog)
-    )
+    with locked_files({"--plot": plot}):
+        inspection = inspect_files(
+            progress_bar("episodes", files, 0, len(files)), load_catalog(catalog)
+        )
+        if plot is not None and inspection.episodes:
+            with writing_file(plot, "--plot"):
+                plot_dataset(plot, inspection.episodes)
     document = inspection_document(inspection)
     print_result(document, describe_inspection(document), as_json, str(dataset))
     if not as_json:
         _print_lines("outlier", document["outliers"])
         _print_lines("problem", document["problems"])
-    if plot is not None and inspection.episodes:
-        with writing_file(plot, "--plot"):
-            plot_dataset(plot, inspection.episodes)
-        if not as_json:
+        if plot is not None and inspection.episodes:
             print_line(f"Wrote {plot}.")
     if inspection.problems:
         raise typer.Exit(1)

@@ -4,7 +4,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stdout, suppress
+from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -140,22 +140,38 @@ def _progress(description: str) -> Progress:
 
 
 @contextmanager
-def writing_file(path: Path, option: str) -> Iterator[None]:
-    """Lock a file while it is written.
+def locked_files(files: Mapping[str, Path | None]) -> Iterator[None]:
+    """Lock output files while their content is computed and written.
 
     Args:
-        path: The file.
+        files: The files by the options that name them; None for an option that is not given.
+
+    Raises:
+        InputError: A file cannot be written, or another run writes it.
+    """
+    with ExitStack() as locks:
+        for option, path in files.items():
+            if path is not None:
+                locks.enter_context(output_file(path, option))
+        yield
+
+
+@contextmanager
+def writing_file(path: Path, option: str) -> Iterator[None]:
+    """Turn the errors of writing a file into an `InputError`.
+
+    Args:
+        path: The file, which is locked.
         option: Option that names it.
 
     Raises:
-        InputError: The file cannot be written, or another run writes it.
+        InputError: The file cannot be written.
     """
-    with output_file(path, option):
-        try:
-            yield
-        except OSError as error:
-            problem = f"cannot be written ({error.strerror}); expected a writable path"
-            raise InputError(f"{option} {path}: {problem}") from error
+    try:
+        yield
+    except OSError as error:
+        problem = f"cannot be written ({error.strerror}); expected a writable path"
+        raise InputError(f"{option} {path}: {problem}") from error
 
 
 def show_recording(
@@ -172,7 +188,7 @@ def show_recording(
         scene: The objects.
         frames: Poses over time; a single frame is a still scene.
         cell: The work cell, whose arm is shown where the frames contain joint positions.
-        html_file: The HTML file; None serves a live view.
+        html_file: The HTML file, which is locked; None serves a live view.
 
     Raises:
         InputError: The HTML file cannot be written.

@@ -6,7 +6,7 @@ from drake_clutter.cli.options import (
     InitialPosesOption,
     SceneArgument,
 )
-from drake_clutter.cli.output import show_recording
+from drake_clutter.cli.output import locked_files, show_recording
 
 
 def view(
@@ -20,6 +20,7 @@ def view(
     from drake_clutter.scenes.interfaces import MotionSample
     from drake_clutter.scenes.scene_file import load_scene
 
-    file = load_scene(scene, load_catalog(catalog))
-    viewed = file.scene if initial_poses else file.settled_scene
-    show_recording(scene, viewed, [MotionSample(0.0, viewed.poses)], file.cell, html_file)
+    with locked_files({"--html": html_file}):
+        file = load_scene(scene, load_catalog(catalog))
+        viewed = file.scene if initial_poses else file.settled_scene
+        show_recording(scene, viewed, [MotionSample(0.0, viewed.poses)], file.cell, html_file)
