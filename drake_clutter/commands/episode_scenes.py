@@ -68,7 +68,7 @@ class SceneLoader(Protocol):
 
 @dataclass(frozen=True)
 class FileScenes:
-    """Scenes of files; episodes go through them again and again.
+    """Scenes of files; the episodes repeat them in their order.
 
     Attributes:
         scenes: The scenes.

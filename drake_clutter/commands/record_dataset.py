@@ -215,7 +215,7 @@ def record_dataset(
     ray_address: str | None = None,
     progress: Progress = _show_nothing,
 ) -> dict[str, Any]:
-    """Record a data set, or go on with an interrupted or shorter one of the same job.
+    """Record a data set, or continue an interrupted or shorter one of the same job.
 
     An exception of the policy ends its episode, which is recorded with the message; the others go
     on.

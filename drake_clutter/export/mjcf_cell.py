@@ -21,7 +21,7 @@ class CellWriter:
     """Adds a work cell to the elements of an MJCF model."""
 
     def __init__(self, model: CellModel, root: Element, folder: Path) -> None:
-        """Take the model and the document.
+        """Create a writer.
 
         Args:
             model: Cell.

@@ -81,7 +81,7 @@ def _add_assets(asset: Element, object_class: ObjectClass, pieces: Sequence[str]
 
 
 def _add_tray(worldbody: Element, support: Support, *, table: bool) -> None:
-    """Add the support, and maybe the table under it, as a fixed body."""
+    """Add the support, and optionally the table under it, as a fixed body."""
     tray = SubElement(worldbody, "body", name=TRAY)
     for box in support_boxes(support, table=table):
         geometry = {

@@ -151,7 +151,7 @@ class _StageWriter:
         UsdShade.MaterialBindingAPI.Apply(geometry.GetPrim()).Bind(material)
 
     def add_tray(self, support: Support, *, table: bool) -> None:
-        """Add the support, and maybe the table under it, as fixed colliders."""
+        """Add the support, and optionally the table under it, as fixed colliders."""
         tray = self._add_xform(self._root, TRAY).GetPath()
         for box in support_boxes(support, table=table):
             shape = Box(*box.size)

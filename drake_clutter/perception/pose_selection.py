@@ -175,7 +175,7 @@ def select_consistent_poses(
     min_visible_fraction: float,
     conflict: Callable[[int, int], bool] = lambda a, b: False,
 ) -> list[int]:
-    """Select the poses that explain the best_objective pixels with the fewest objects.
+    """Select the poses that explain the most pixels with the fewest objects.
 
     The greedy selection is repeated with each unselected pose as its first one, and the best
     result counts.

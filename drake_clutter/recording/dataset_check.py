@@ -135,7 +135,7 @@ def _check_times(samples: ActionSamples, rate: float) -> Iterator[str]:
 
 
 def _check_numbers(samples: ActionSamples) -> Iterator[str]:
-    """Yield channels with numbers that are not finite, and quaternions that are no unit ones."""
+    """Yield channels with numbers that are not finite or quaternions without unit norm."""
     for channel in CHANNELS:
         values = getattr(samples, channel.name)
         bad = ~np.isfinite(values) if values.dtype.kind == "f" else np.zeros(1, dtype=bool)

@@ -1,4 +1,4 @@
-"""Figures of a data set: a row for each attempted move, and what stands out.
+"""Figures of a data set: a row for each attempted move, and outliers.
 
 Frames: T is the support, G is the tool that the action uses.
 """
@@ -191,7 +191,7 @@ def count_reasons(episodes: Iterable[EpisodeFigures]) -> Counter[str]:
 
 
 def find_outliers(episodes: Sequence[EpisodeFigures]) -> list[str]:
-    """Return the executed moves whose duration, path or place is far out, in words."""
+    """Return the executed moves whose duration, path or place is an outlier, as text."""
     rows = [action for action in attempted(episodes) if action.motion is not None]
     found = [row.motion for row in rows if row.motion is not None]
     texts = list[str]()

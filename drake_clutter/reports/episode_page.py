@@ -148,7 +148,7 @@ class _PageImages:
 
 
 def _recording_note(steps: Sequence[Transition]) -> str:
-    """Return what of the recording is simulated."""
+    """Return which part of the recording is simulated."""
     if any(step.outcome.samples is not None for step in steps):
         return _RECORDING_NOTES["arm"]
     return _RECORDING_NOTES["settle" if any(step.outcome.motion for step in steps) else "static"]

@@ -62,7 +62,7 @@ def _is_shown(row: Row, setup: str) -> bool:
 
 
 def _mark(row: Row) -> dict[str, Any]:
-    """Return a move as a mark: where it is, what became of it, and the text on it."""
+    """Return a move as a mark: position, result and text."""
     lines = [f"{row['scene']}: {row['pick']} to {row['place']}"]
     lines.append(": ".join(filter(None, (row["result"], row["detail"]))))
     if row["clearance"] is not None and math.isfinite(row["clearance"]):

@@ -108,7 +108,7 @@ def write_feasibility_report(
 
 
 def answer_sentences(summary: Row) -> list[str]:
-    """Return three sentences that answer the question of a study.
+    """Return a summary of a study in three sentences.
 
     Args:
         summary: Document of `summary.json`.

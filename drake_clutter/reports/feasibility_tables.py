@@ -29,7 +29,7 @@ def _format(value: float | None, digits: int, unit: str = "") -> str:
 def _with_interval(
     value: float | None, bounds: Sequence[float | None] | None, digits: int = 3, unit: str = ""
 ) -> str:
-    """Return a value with its interval; "-" stands for what the data do not tell."""
+    """Return a value with its interval; "-" if the data do not determine it."""
     if value is None or bounds is None or all(bound is None for bound in bounds):
         return _format(value, digits, unit)
     low, high = (_format(bound, digits) for bound in bounds)

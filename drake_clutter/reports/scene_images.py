@@ -1,4 +1,4 @@
-"""Images of scenes for people: from above and from the front, plain or annotated."""
+"""Images of scenes for pages: from above and from the front, plain or annotated."""
 
 import re
 from dataclasses import dataclass
@@ -93,7 +93,7 @@ class Annotations:
 
 
 def display_name(name: str) -> str:
-    """Return an identifier as people write it: "sugar_box_3" is "Sugar box 3"."""
+    """Return an identifier as text: "sugar_box_3" is "Sugar box 3"."""
     words = name.replace("_", " ").strip()
     return words[:1].upper() + words[1:]
 

@@ -95,7 +95,7 @@ def write_robomimic(path: Path, episodes: Iterable[RecordedEpisode]) -> int:
 
 
 class _DeferredErrors:
-    """File object that reports a failed write when it is asked.
+    """File object that keeps the error of a failed write for `check`.
 
     HDF5 crashes if writing fails while it closes a file.
     """
