@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from drake_clutter.agents.area_reduction import uncovered_areas
 from drake_clutter.agents.behavior_cloning import BehaviorCloningConfig, BehaviorCloningLearner
-from drake_clutter.agents.episode_evaluation import EpisodeResult
+from drake_clutter.agents.episode_evaluation import EpisodeResult, EpisodeRunner, EpisodeSpec
 from drake_clutter.agents.explorer_network import ExplorerNetwork, collate_graphs, sample_actions
 from drake_clutter.agents.explorers import make_policy_factory
 from drake_clutter.agents.learned_explorer import (
@@ -199,6 +199,27 @@ def test_policies_that_need_a_target(tmp_path: Path) -> None:
         make_policy = make_policy_factory(agent, WORLD, with_target=True)
         with pytest.raises(InputError, match="looks for one object; expected a target"):
             make_policy(backend)
+
+
+@pytest.mark.parametrize("agent", ["area-reduction", "student", "full-knowledge"])
+def test_a_policy_is_loaded_once_for_all_targets(agent: str) -> None:
+    """Episodes of one runner have the results that a new runner for each of them has."""
+    scenes = SCENES / "sg_star_10.json"
+    dataset = load_scene_dataset(scenes, CATALOG)
+    episodes = []
+    for index in range(3):
+        scene = dataset.settled_scene(index, dataset.grammar, WORLD)
+        in_view = {d.name for d in JUDGE.ray_caster.observe(scene)[0].detections}
+        target = sorted(set(scene.names) - in_view)[0]
+        episodes.append(EpisodeSpec(scenes, index, agent, index, target))
+
+    def runner() -> EpisodeRunner:
+        return EpisodeRunner(WORLD, None, 4, 0, "static")
+
+    shared = runner()
+    results = [shared(episode) for episode in episodes]
+    assert results == [runner()(episode) for episode in episodes]
+    assert any(result.ended == "target found" for result in results)
 
 
 @pytest.fixture(scope="module")
