@@ -319,9 +319,9 @@ def test_results_files_with_earlier_names_load() -> None:
     [
         ((0.075, 0.0), 0.0, "pudding_box and can", 0.013),
         ((0.2, 0.2), -0.037, "can and floor", 0.037),
-        ((0.088, 0.0), 0.0, "", 0.0),
+        ((0.0865, 0.0), 0.0, "", 0.0),
     ],
-    ids=["in a box", "in the floor", "touching"],
+    ids=["in a box", "in the floor", "as objects that lean"],
 )
 def test_objects_that_overlap_at_the_start_are_refused(
     xy: tuple[float, float], floor: float, pair: str, depth: float
