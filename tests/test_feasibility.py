@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from conftest import DEFAULT_CELL, ONE_CUP, cell_with, resting, rng, scene_of
 from feasibility_jobs import feasibility_job
+from matplotlib.patches import Rectangle
 from typer.testing import CliRunner
 
 from drake_clutter.cell.work_cell import WorkCell, load_cell
@@ -430,6 +431,21 @@ def test_all_moves_are_in_the_plot_over_the_support() -> None:
     (panel, _) = figure.axes
     assert sorted(text.get_text() for text in panel.texts) == ["1", "1"]
     assert panel.images[0].get_extent() == pytest.approx([-0.15, 0.15, -0.5, 0.5])
+
+
+def test_reasons_of_failures_are_those_of_the_setups_shown() -> None:
+    """Of two moves of a, one fails; b, which fails for another reason, is not shown."""
+    row = {"setup": "a", "scene": "s", "possible": True}
+    moves = [
+        row | {"result": PLANNED},
+        row | {"result": "unreachable"},
+        row | {"setup": "b", "result": "in collision"},
+    ]
+    (axes,) = feasibility_figures.plot_failures(moves, ["a"]).axes
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["unreachable"]
+    (bar,) = axes.patches
+    assert isinstance(bar, Rectangle)
+    assert bar.get_width() == 0.5
 
 
 def test_interactive_maps_hold_the_rows(tmp_path: Path) -> None:

@@ -57,10 +57,10 @@ def plot_ranking(summary: Row) -> Figure:
 
 def plot_failures(moves: Rows, setups: Sequence[str]) -> Figure:
     """Plot the share of the possible moves with each reason of failure, and its interval."""
-    possible = [row for row in moves if row["possible"]]
+    possible = [row for row in moves if row["possible"] and row["setup"] in setups]
     failed = Counter(row["result"] for row in possible if row["result"] != PLANNED)
     reasons = [reason for reason, _ in failed.most_common()]
-    size = 1.6 + 0.3 * len(reasons) * (1 + len(setups))
+    size = 2.2 + 0.3 * len(reasons) * (1 + len(setups))
     figure = Figure(figsize=(11, min(size, 12)))
     axes = figure.subplots()
     height = 0.8 / len(setups)
@@ -80,9 +80,15 @@ def plot_failures(moves: Rows, setups: Sequence[str]) -> Figure:
     axes.set(xlabel="share of the possible moves (bars: 95 % interval; labels: number of moves)")
     axes.set_xlim(0, None)
     axes.margins(x=0.15)
-    if len(setups) > 1:
-        axes.legend(fontsize=10)
+    _add_legend(figure, axes)
     return figure
+
+
+def _add_legend(figure: Figure, axes: Any) -> None:
+    """Add the legend of axes with several setups below the figure."""
+    handles, labels = axes.get_legend_handles_labels()
+    if len(labels) > 1:
+        figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=10)
 
 
 def _share(rows: Rows) -> float:
@@ -147,8 +153,7 @@ def plot_by_object(moves: Rows, setups: Sequence[str]) -> Figure:
         "height of the top face",
     )
     axes[0].set_ylabel(_SHARE_LABEL)
-    if len(setups) > 1:
-        axes[2].legend(fontsize=11)
+    _add_legend(figure, axes[0])
     return figure
 
 
@@ -313,5 +318,5 @@ def plot_noise(summary: Row) -> Figure:
         panel.set_title(title, fontsize=12)
         panel.set(xlabel=f"standard deviation\n{label}", ylim=(0, 1.03))
     axes[0].set_ylabel("share of the moves placed in simulation")
-    axes[0].legend(fontsize=10)
+    _add_legend(figure, axes[0])
     return figure

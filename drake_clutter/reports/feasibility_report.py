@@ -171,16 +171,21 @@ def _summary_parts(results: StudyResults) -> Iterable[str]:
     if summary["comparisons"]:
         yield "<h2>Differences between setups</h2>"
         table = comparisons_table(summary["comparisons"])
-        count = len(summary["comparisons"])
-        is_long = count > MAX_COMPARISONS
-        yield f"<details><summary>{count} pairs</summary>{table}</details>" if is_long else table
+        yield _folded(table, len(summary["comparisons"]), "pairs", MAX_COMPARISONS)
     yield "<h2>Margins of the planned moves</h2>"
-    yield margins_table(summary)
+    yield _folded(margins_table(summary), count, "setups", MAX_PANELS)
     if results.sequences:
         yield "<h2>Searches of whole scenes</h2>"
         yield sequences_table(summary)
     if results.targets:
         yield f"<h2>Target poses</h2>{targets_table(results.targets)}"
+
+
+def _folded(table: str, count: int, unit: str, most: int) -> str:
+    """Return a table, which is folded up if it has too many rows."""
+    if count <= most:
+        return table
+    return f"<details><summary>{count} {unit}</summary>{table}</details>"
 
 
 def _figure_parts(results: StudyResults) -> Iterable[str]:
@@ -192,8 +197,12 @@ def _figure_parts(results: StudyResults) -> Iterable[str]:
     shown = "" if len(ranking) <= MAX_LEGEND else f" (the best {MAX_LEGEND} setups)"
     if len(ranking) > 1:
         yield _figure("Ranking", plot_ranking(summary))
-    if any(setup["failures"] for setup in summary["setups"]):
-        yield _figure(f"Reasons of failures{shown}", plot_failures(moves, legend))
+    failures = {setup["name"]: setup["failures"] for setup in summary["setups"]}
+    failing = [name for name in ranking if failures[name]]
+    if failing:
+        title = "Reasons of failures"
+        title += "" if len(failing) <= MAX_LEGEND else f" (the best {MAX_LEGEND} setups with any)"
+        yield _figure(title, plot_failures(moves, failing[:MAX_LEGEND]))
     yield _figure(
         f"Planned share by picked object{shown}",
         plot_by_object(moves, legend),
