@@ -17,7 +17,7 @@ from drake_clutter.cell.gripper import Tool
 from drake_clutter.cell.support_sdf import FLOOR, support_boxes
 from drake_clutter.compilation import njit
 from drake_clutter.planning.collision_model import CollisionModel
-from drake_clutter.planning.tool_kinematics import ToolKinematics
+from drake_clutter.planning.tool_kinematics import ToolKinematics, invert_pose
 from drake_clutter.robots.inverse_kinematics import UrInverseKinematics
 from drake_clutter.robots.serial_chain import SerialChain, chain_frames
 from drake_clutter.robots.ur_kinematics import UR10_PARAMETERS, forward_kinematics
@@ -90,10 +90,9 @@ class ArmGeometry:
         )
         zero = np.zeros(len(self.limits))
         chain = SerialChain(self.fixed, np.ones(len(zero), bool))
-        X_6B = np.linalg.inv(forward_kinematics(zero, parameters)) @ self.X_0B
-        return np.asarray(
-            self.X_G6 @ X_6B @ chain.forward_kinematics(zero) @ np.linalg.inv(self.fixed[-1])
-        )
+        X_6B = invert_pose(forward_kinematics(zero, parameters)) @ self.X_0B
+        X_GF = self.X_G6 @ X_6B @ chain.forward_kinematics(zero)
+        return np.asarray(X_GF @ invert_pose(self.fixed[-1]))
 
     @staticmethod
     def from_model(
