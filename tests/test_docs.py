@@ -98,6 +98,7 @@ ADDED = {
 """Options that are added to a command of `drake-clutter` or a script, by its name."""
 
 PARSED = {
+    "base_study",
     "carry_clearance",
     "collect_drake_verdicts",
     "evaluate_closed_loop",
