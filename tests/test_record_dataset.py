@@ -11,6 +11,7 @@ import pytest
 from conftest import CATALOG, DEFAULT_CELL, WORLD, resting, scene_of
 from typer.testing import CliRunner
 
+from benchmarks import recording_throughput
 from drake_clutter.cell.work_cell import load_cell
 from drake_clutter.cli.app import app
 from drake_clutter.commands.episode_scenes import FileScenes, find_scenes
@@ -28,9 +29,12 @@ from drake_clutter.recording.hdf5_file import load_episode
 from drake_clutter.recording.randomization import load_randomization
 from drake_clutter.resources import resource_path
 from drake_clutter.scenes.interfaces import Move, MoveResult, Observation
+from drake_clutter.scenes.scene_dataset import load_scene_dataset, save_scene_dataset
 from drake_clutter.scenes.scene_file import save_scene
+from drake_clutter.simulation.drake_judge import DrakeJudge
 from drake_clutter.station.station_simulation import COARSE_TIME_STEP
 from drake_clutter.tasks.belief import Belief, Decision
+from training import record_sg_star_dataset
 
 CAMERAS = CameraOptions(("wrist",), (CameraChannel.RGB, CameraChannel.SEGMENTATION), (64, 48))
 
@@ -263,6 +267,60 @@ def test_a_generator_gives_each_episode_a_stable_scene() -> None:
     assert first.poses != second.poses
     assert name.startswith("random ")
     assert {o.object_class.name for o in first.objects} <= source.classes
+
+
+def test_graphs_of_a_training_set_are_laid_out_for_each_episode(tmp_path: Path) -> None:
+    shipped = load_scene_dataset(resource_path("training/scenes/sg_star_10.json"), CATALOG)
+    graphs = [replace(record, settled_poses=None) for record in shipped.scenes[:2]]
+    save_scene_dataset(tmp_path / "train.json", shipped.metadata, graphs, shipped.cell)
+    load = find_scenes(str(tmp_path / "train.json"), WORLD).make_loader(WORLD)
+    (first, name), (third, third_name) = load(0), load(2)
+    assert (name, third_name) == ("train 0", "train 0"), "the second has episode 1"
+    assert first.names == third.names
+    assert first.derivation == third.derivation == shipped.scenes[0].rules
+    assert first.poses != third.poses
+    verdict = DrakeJudge(WORLD).judge(first, np.random.default_rng(0))
+    moved = [np.linalg.norm(verdict.settled[name].p - X_TO.p) for name, X_TO in first.poses.items()]
+    assert max(moved) < 0.003, "it is at rest"
+
+
+def test_the_set_of_1000_moves_is_recorded_and_resumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(record_sg_star_dataset, "MAX_MOVES", 1)
+    out, card = tmp_path / "moves", tmp_path / "card"
+    record_sg_star_dataset.main(out, card, moves=1)
+    summary = json.loads((card / "summary.json").read_text())
+    assert summary["executed_moves"] == 1
+    assert {path.name for path in card.iterdir()} == {
+        *("README.md", "contact_sheet.png", "figures.png", "job.json", "summary.json")
+    }
+    episodes = sorted((out / "episodes").iterdir())
+    assert len(episodes) == summary["episodes"]
+    action = load_episode(episodes[-1], CATALOG).actions[0]
+    assert action.result.was_executed
+    depth = action.images["overhead"].depth
+    assert depth is not None
+    assert depth.shape[1:] == (240, 320)
+    before = [path.stat().st_mtime_ns for path in episodes]
+    record_sg_star_dataset.main(out, moves=1)
+    assert [path.stat().st_mtime_ns for path in episodes] == before
+    line = capsys.readouterr().out.splitlines()[-1]
+    assert line == f"1 of {summary['moves']} moves carried out in {len(episodes)} episodes"
+
+
+def test_recording_is_timed(scenes: FileScenes) -> None:
+    job = RecordingJob(FileScenes(scenes.scenes[:2], None), (Move("box"),), WORLD, max_moves=1)
+    timing = recording_throughput.time_dataset(job, 2, 1)
+    assert (timing.moves, timing.counted) == (2, 1)
+    assert min(timing.start, timing.recording, timing.finish) > 0
+    shares = recording_throughput.profile(job, 2)
+    assert sum(shares.values()) == pytest.approx(1)
+    assert shares["simulation"] > shares["perception"] > 0
+    assert shares["images"] == 0
+    row = recording_throughput.model_row(rate=3600.0, start=100.0, serial=0.001, workers=100)
+    assert row["hours"] == pytest.approx((100 + 100 + 1000) / 3600)
+    assert row["core_hours_per_1000_moves"] == pytest.approx(100 * 1200 / 3600 / 100)
 
 
 def test_the_command_prints_counts_and_the_first_error(scenes: FileScenes, tmp_path: Path) -> None:

@@ -26,11 +26,13 @@ from drake_clutter.grammar import NodeBudget
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.scenes.scene_dataset import load_scene_dataset
 from drake_clutter.scenes.scene_file import load_scene
+from drake_clutter.seeding import item_rng
+from drake_clutter.simulation.drake_judge import DrakeJudge
 
 GENERATORS = ("random", "hill-climbing", *PRETRAINED_GENERATORS)
 """Names of the scene generators; a checkpoint file is one, too."""
 MAX_UNSTABLE_SCENES = 100
-"""Number of unstable scenes in a row after which a generator is of no use."""
+"""Number of unstable scenes in a row after which a generator or a graph is of no use."""
 
 
 class SceneSource(Protocol):
@@ -123,8 +125,21 @@ class FileScenes:
                 )
                 return at_rest, scene.file.stem
             dataset = load_dataset(scene.file)
-            at_rest = dataset.settled_scene(scene.index, dataset.grammar, config)
-            return at_rest, f"{scene.file.stem} {scene.index}"
+            name = f"{scene.file.stem} {scene.index}"
+            if dataset.scenes[scene.index].settled_poses is not None:
+                return dataset.settled_scene(scene.index, dataset.grammar, config), name
+            # A training set holds graphs, and each episode lays out one anew.
+            judge = DrakeJudge(config)
+            for attempt in range(MAX_UNSTABLE_SCENES):
+                rng = item_rng(index, attempt)
+                laid_out = dataset.laid_out_scene(scene.index, dataset.grammar, config, rng)
+                verdict = judge.judge(laid_out, rng)
+                if verdict.stable:
+                    return laid_out.with_poses(verdict.settled), name
+            raise InputError(
+                f"{name}: {MAX_UNSTABLE_SCENES} layouts in a row are not stable; expected a scene "
+                "dataset of this work cell"
+            )
 
         return load
 

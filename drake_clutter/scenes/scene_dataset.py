@@ -101,6 +101,17 @@ class SceneDataset:
         with reading_file(f"{self.name}: scenes[{index}].rules", "a derivation of the grammar"):
             return Derivation(grammar.replay(rules), rules)
 
+    def laid_out_scene(
+        self, index: int, grammar: SceneGrammar, config: ClutterConfig, rng: np.random.Generator
+    ) -> Scene:
+        """Return a scene with its stacks in new positions, on the dataset's support.
+
+        Raises:
+            InputError: No layout fits on the support.
+        """
+        world = replace(config, cell=config.cell.with_support(self.cell.support))
+        return relayout(self.derivation(index, grammar), grammar, world, rng)
+
     def settled_scene(self, index: int, grammar: SceneGrammar, config: ClutterConfig) -> Scene:
         """Return a scene with its settled poses, on the dataset's support.
 
@@ -112,10 +123,7 @@ class SceneDataset:
             raise InputError(
                 f"{self.name}: holds graphs without poses; expected a dataset with settled poses"
             )
-        world = replace(config, cell=config.cell.with_support(self.cell.support))
-        scene = relayout(
-            self.derivation(index, grammar), grammar, world, np.random.default_rng(index)
-        )
+        scene = self.laid_out_scene(index, grammar, config, np.random.default_rng(index))
         if len(poses) != len(scene.names):
             raise InputError(
                 f"{self.name}: scenes[{index}].settled: {len(poses)} poses; "
