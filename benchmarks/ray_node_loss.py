@@ -6,8 +6,10 @@
 The nodes are two network namespaces of this machine, which a virtual Ethernet cable connects; to
 make them needs Linux and root. The command runs twice, with `--out`, `--workers` and `--ray` added:
 with one worker and without Ray into FOLDER/local, and with one worker on each node into FOLDER/ray.
-When FOLDER/ray has half of the bytes of FOLDER/local, the cable is cut and every process of the
-second node is killed. The exit code is 1 unless both folders hold the same bytes.
+When FOLDER/ray has half of the items of FOLDER/local, which are its files and the lines of its
+record files, the cable is cut and every process of the second node is killed. The exit code is 1
+unless both folders hold the same bytes; JSON files may differ in `VARYING_FIELDS`. `--results FILE`
+adds a row to a results file.
 """
 
 import hashlib
@@ -28,6 +30,7 @@ from typing import Annotated
 import typer
 
 from drake_clutter.files import InputError
+from training.results_file import ResultsFile, provenance
 from training.script import run_script
 
 ADDRESSES = ("10.77.0.1", "10.77.0.2")
@@ -36,7 +39,9 @@ PORT = 6379
 RAY = str(Path(sys.executable).with_name("ray"))
 """Ray's program, of the environment of this script."""
 POLL_PERIOD = 0.1
-"""Period at which the size of the output is looked up [s]."""
+"""Period at which the items of the output are counted [s]."""
+VARYING_FIELDS = ("seconds", "workers")
+"""Fields of JSON files that say how long a run took with how many workers."""
 
 
 @dataclass(frozen=True)
@@ -144,33 +149,63 @@ def ray_cluster(first: Node, second: Node) -> Iterator[str]:
             first.kill()
 
 
-def folder_size(folder: Path) -> int:
-    """Return the size of all files of a folder [bytes]."""
-    size = 0
+def count_items(folder: Path) -> int:
+    """Return the number of files of a folder, with the lines instead of each record file."""
+    items = 0
     for path in folder.rglob("*"):
         with suppress(FileNotFoundError):  # It was temporary.
-            size += path.stat().st_size if path.is_file() else 0
-    return size
+            if path.suffix == ".jsonl":
+                items += path.read_bytes().count(b"\n")
+            elif path.is_file():
+                items += 1
+    return items
 
 
 def file_hashes(folder: Path) -> dict[str, str]:
-    """Return the SHA-256 of each file of a folder, by its path in it."""
-    return {
-        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
+    """Return the SHA-256 of each file of a folder, by its path in it.
+
+    `VARYING_FIELDS` of JSON documents are left out.
+    """
+    hashes = dict[str, str]()
+    for path in sorted(folder.rglob("*")):
+        if path.is_file():
+            data = path.read_bytes()
+            if path.suffix == ".json" and isinstance(document := json.loads(data), dict):
+                kept = {key: document[key] for key in document if key not in VARYING_FIELDS}
+                data = json.dumps(kept).encode() if kept != document else data
+            hashes[str(path.relative_to(folder))] = hashlib.sha256(data).hexdigest()
+    return hashes
+
+
+def run_here(command: Sequence[str], out: Path) -> int:
+    """Run a command and return the largest number of items that its output has had.
+
+    Args:
+        command: Command with all options.
+        out: Folder of its output.
+
+    Raises:
+        InputError: The command ends with an error.
+    """
+    items = 0
+    with subprocess.Popen(command) as process:
+        while process.poll() is None:
+            items = max(items, count_items(out))
+            time.sleep(POLL_PERIOD)
+    if process.returncode:
+        raise InputError(f"{' '.join(command)}: exit code {process.returncode}")
+    return max(items, count_items(out))
 
 
 def run_with_loss(
-    command: Sequence[str], out: Path, size_of_loss: float, nodes: tuple[Node, Node]
+    command: Sequence[str], out: Path, items_of_loss: float, nodes: tuple[Node, Node]
 ) -> dict[str, int]:
     """Run a command on the cluster, and lose the second node on its way.
 
     Args:
         command: Command with its options but those of the cluster.
         out: Folder of its output.
-        size_of_loss: Size of the output at which the node is lost [bytes].
+        items_of_loss: Number of items of the output at which the node is lost.
         nodes: The nodes.
 
     Returns:
@@ -186,10 +221,10 @@ def run_with_loss(
             is_due = False
             while not is_due and process.poll() is None:
                 time.sleep(POLL_PERIOD)
-                is_due = folder_size(out) >= size_of_loss and second.count_workers() > 0
+                is_due = count_items(out) >= items_of_loss and second.count_workers() > 0
             if not is_due:
                 raise InputError(f"{' '.join(words)}: ended before a node was lost")
-            loss = {"bytes_at_loss": folder_size(out), "lost_workers": second.count_workers()}
+            loss = {"items_at_loss": count_items(out), "lost_workers": second.count_workers()}
             second.cut()
             loss["killed_processes"] = second.kill()
             if process.wait():
@@ -205,6 +240,9 @@ def main(
     output: Annotated[
         str, typer.Option(metavar="NAME", help="Name of the command's --out in each folder.")
     ] = "out",
+    results: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Results file to which a row is added.")
+    ] = None,
 ) -> None:
     """Lose a node of a cluster and compare the output with that of a local run."""
     local, there = folder / "local", folder / "ray"
@@ -213,16 +251,18 @@ def main(
             raise InputError(f"{path}: exists; expected a FOLDER without outputs")
         path.mkdir(parents=True)
     print(f"local: {' '.join(command)}", flush=True)
-    run_locally = subprocess.run([*command, "--out", str(local / output), "--workers", "1"])
-    if run_locally.returncode:
-        raise InputError(f"{' '.join(command)}: exit code {run_locally.returncode}")
+    items = run_here([*command, "--out", str(local / output), "--workers", "1"], local)
     with connected_nodes() as nodes:
         print("two nodes", flush=True)
         command_there = [*command, "--out", str((there / output).resolve())]
-        loss = run_with_loss(command_there, there, folder_size(local) / 2, nodes)
+        loss = run_with_loss(command_there, there, items / 2, nodes)
     expected, found = file_hashes(local), file_hashes(there)
     different = sorted(path for path in expected | found if expected.get(path) != found.get(path))
-    print(json.dumps({**loss, "files": len(expected), "different": different}))
+    row = {"items": items, **loss, "files": len(expected), "different": different}
+    print(json.dumps(row))
+    if results is not None:
+        row = {"command": " ".join(command), **row, **provenance()}
+        ResultsFile(results, {}, ("command",)).add(row)
     if different:
         raise typer.Exit(1)
 

@@ -3,11 +3,14 @@
 import json
 
 from markdown_text import number, section, table
-from results_files import ROOT, read_benchmark_results
+from results_files import ROOT, has_benchmark_results, read_benchmark_results
 
 DATASET = "training/datasets/sg_star_25_moves"
 """Folder of the card of the recorded data set."""
 SUMMARY_FILE = "summary.json"
+NODE_LOSS = "ray_node_loss.json"
+"""Results file of `benchmarks/ray_node_loss.py`."""
+NODE_LOSS_COUNTS = ("items", "items_at_loss", "lost_workers", "killed_processes", "files")
 
 IMAGES = {"none": "none", "RGB-D": "color and depth"}
 """Names of the kinds of images, by those in the results file."""
@@ -71,7 +74,41 @@ def page() -> str:
     )
     if (ROOT / DATASET / SUMMARY_FILE).exists():
         text += "\n" + _dataset()
+    if has_benchmark_results(NODE_LOSS):
+        text += "\n" + _node_loss()
     return text
+
+
+def _node_loss() -> str:
+    """Return the section of the commands during which a node of a cluster was lost."""
+    text = section(
+        "Loss of a node",
+        "Commands on a Ray cluster of two nodes, network namespaces of one machine, with one "
+        "worker each. When half of the items are there, the cable is cut and all processes of a "
+        "node are killed. *Different*: files whose bytes differ from those of a local run; of JSON "
+        "files the fields `seconds` and `workers` are left out.",
+        command="python benchmarks/ray_node_loss.py FOLDER --results FILE -- COMMAND",
+        results=[f"benchmarks/results/{NODE_LOSS}"],
+    )
+    return text + table(
+        [
+            "command",
+            "items",
+            "at the loss",
+            "lost workers",
+            "killed processes",
+            "files",
+            "different",
+        ],
+        [
+            [
+                f"`{row['command']}`",
+                *(str(row[key]) for key in NODE_LOSS_COUNTS),
+                str(len(row["different"])),
+            ]
+            for row in read_benchmark_results(NODE_LOSS)["rows"]
+        ],
+    )
 
 
 def _dataset() -> str:
