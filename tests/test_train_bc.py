@@ -13,12 +13,14 @@ from drake_clutter.files import InputError
 from drake_clutter.planning.motion_plan import MotionPlan
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.recording.hdf5_file import save_episode
 from drake_clutter.recording.recorded_episode import CameraImages
+from drake_clutter.scenes.action_samples import PHASES
 from training.reaching_demonstrations import (
     CROP,
     Demonstration,
-    ToolKinematics,
+    common_branch,
     crop_image,
     object_target,
     read_demonstrations,
@@ -28,6 +30,7 @@ from training.reaching_demonstrations import (
 from training.reaching_learner import CloningConfig, CloningLearner, StateSampler
 from training.reaching_playback import play
 from training.reaching_policy import LOOKAHEAD, ReachingPolicy
+from training.train_bc import held_out_moves
 
 PLACES = ((0.1, 0.1), (-0.1, 0.15), (0.05, -0.15))
 
@@ -63,9 +66,9 @@ def demonstrations() -> list[Demonstration]:
 def test_demonstrations_end_at_their_target(demonstrations: list[Demonstration]) -> None:
     for d, xy in zip(demonstrations, PLACES, strict=True):
         assert d.target == pytest.approx([*xy, 0.038, 0.0], abs=1e-9)
-        p_TG, axis = ToolKinematics(d.cell, d.tool).pose(d.q[-1])
-        assert p_TG == pytest.approx(d.target[:3], abs=0.002)
-        assert axis == pytest.approx([0, 0, -1], abs=1e-3)
+        X_TG = ToolKinematics(d.cell, d.tool).pose(d.q[-1])
+        assert X_TG[:3, 3] == pytest.approx(d.target[:3], abs=0.002)
+        assert X_TG[:3, 2] == pytest.approx([0, 0, -1], abs=1e-3)
 
 
 def test_waypoints_are_commands_ahead(demonstrations: list[Demonstration]) -> None:
@@ -88,6 +91,40 @@ def test_waypoints_are_commands_ahead(demonstrations: list[Demonstration]) -> No
     assert distances.max() < 1e-5
     offsets = (near.q[:, None] - states.q[None]).abs().amax(dim=2).amin(dim=1)
     assert offsets.max() > 0.01
+
+
+def test_a_policy_turns_with_the_arm() -> None:
+    """A scene that is turned about the base of the robot is reached by the same changes."""
+    torch.manual_seed(1)
+    policy = ReachingPolicy("state", 6)
+    policy.base.copy_(torch.tensor([0.8, -0.1, 0.2]))
+    q = torch.tensor([[0.3, -1.2, 2.0, -2.3, -1.5, 0.4]])
+    positions = torch.tensor([[0.1, 0.2, 0.4], [-0.1, 0.25, 0.15]])
+    axis = torch.tensor([[0.1, -0.05, -0.99]])
+    rise = torch.tensor([[0.07]])
+    c, s = np.cos(0.7), np.sin(0.7)
+    R = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float32)
+    turned = (positions - policy.base) @ R.T + policy.base
+    q_turned = q + torch.tensor([0.7, 0.0, 0.0, 0.0, 0.0, 0.0])
+    with torch.inference_mode():
+        first = policy(q, positions[:1], axis, torch.cat([positions[1:], rise], dim=1))
+        second = policy(q_turned, turned[:1], axis @ R.T, torch.cat([turned[1:], rise], dim=1))
+        other = policy(q, turned[:1], axis, torch.cat([positions[1:], rise], dim=1))
+    assert second.numpy() == pytest.approx(first.numpy(), abs=1e-5)
+    assert np.abs((other - first).numpy()).max() > 1e-3
+
+
+def test_only_the_common_branch_is_learned(demonstrations: list[Demonstration]) -> None:
+    flipped = demonstrations[1].q.copy()
+    flipped[-1, 4] += np.pi  # The wrist is turned to the other side.
+    turned = demonstrations[2].q.copy()
+    turned[-1, [0, 5]] += np.pi  # The arm and the tool about their own axes.
+    given = [
+        demonstrations[0],
+        replace(demonstrations[1], q=flipped),
+        replace(demonstrations[2], q=turned),
+    ]
+    assert common_branch(given) == [given[0], given[2]]
 
 
 def test_policy_reaches_what_it_has_learned(demonstrations: list[Demonstration]) -> None:
@@ -154,15 +191,42 @@ def test_first_images_are_those_of_the_recording(tmp_path: Path) -> None:
     assert read_first_images(tmp_path / "episode.h5", 2) is None  # It was not executed.
 
 
-def test_held_out_moves_are_of_other_scenes(demonstrations: list[Demonstration]) -> None:
-    learned, held_out = split(demonstrations, 1)
+def test_held_out_moves_are_recorded_grasps_of_other_scenes(tmp_path: Path) -> None:
+    (tmp_path / "episodes").mkdir()
+    for index in range(3):
+        episode = synthetic_episode(cameras={"overhead": 4}, index=index)
+        action = episode.actions[0]
+        assert action.samples is not None
+        phase = action.samples.phase.copy()
+        phase[8:11] = PHASES.index("grasp")  # The object is held from sample 11 on.
+        grasping = replace(action, samples=replace(action.samples, phase=phase))
+        episode = replace(
+            episode, actions=(grasping, *episode.actions[1:]), scene_name=f"s {index}"
+        )
+        save_episode(tmp_path / "episodes" / f"episode_{index:06d}.h5", episode)
+    moves = held_out_moves(tmp_path, "large", 1, 2, {"s 0"})
+    assert [d.name for d in moves] == ["episode_000001 1", "episode_000002 1"]
+    assert (moves[0].scene_name, moves[0].pick) == ("s 1", "gelatin_box")
+    samples = synthetic_episode().actions[0].samples
+    assert samples is not None
+    assert moves[0].q == pytest.approx(samples.q_commanded[:9])
+    assert moves[0].time[-1] == pytest.approx(8 / 20)
+    assert moves[0].target[:2] == pytest.approx([0.1, 0.1])
+    with pytest.raises(InputError, match=r"--count 3: .* has 2 moves with images from episode 1"):
+        held_out_moves(tmp_path, "large", 1, 3, set())
+    with pytest.raises(InputError, match="scene s 2 was learned; expected other scenes"):
+        held_out_moves(tmp_path, "large", 1, 2, {"s 2", "s 7"})
+
+
+def test_validation_moves_are_of_other_scenes(demonstrations: list[Demonstration]) -> None:
+    learned, validation = split(demonstrations, 1)
     assert [d.name for d in learned] == ["episode_000000 1", "episode_000001 1"]
-    assert [d.name for d in held_out] == ["episode_000002 1"]
+    assert [d.name for d in validation] == ["episode_000002 1"]
     again = replace(demonstrations[0], name="episode_000003 1")
-    learned, held_out = split([*demonstrations, again], 1)
+    learned, validation = split([*demonstrations, again], 1)
     assert [d.name for d in learned] == ["episode_000001 1", "episode_000002 1"]
-    assert held_out == [again]
-    with pytest.raises(InputError, match="held_out: 2 of 3 moves; expected at most half"):
+    assert validation == [again]
+    with pytest.raises(InputError, match="validation: 2 of 3 moves; expected at most half"):
         split(demonstrations, 2)
 
 

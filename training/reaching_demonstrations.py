@@ -16,7 +16,6 @@ from drake_clutter.cell.work_cell import WorkCell
 from drake_clutter.files import InputError, reading_file
 from drake_clutter.recording.hdf5_file import action_name, load_episode
 from drake_clutter.recording.recorded_episode import CameraImages
-from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.action_samples import PHASES
 from drake_clutter.scenes.scene import Pose, Scene
 
@@ -28,6 +27,8 @@ NEIGHBORHOOD = 0.15
 """Horizontal distance from the target within which objects are its neighbors [m]."""
 CROP = 64
 """Side of the part of the depth image around the mask of the object [px]."""
+BRANCH_RADIUS = np.pi / 2
+"""Largest distance of a joint from its median angle in the same branch [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,17 +138,18 @@ def crop_image(images: CameraImages | None, index: int) -> NDArray[np.float32] |
     return np.concatenate([p_T, mask[None]])[window].astype(np.float32)
 
 
-def read_demonstrations(folder: Path, tool: str) -> list[Demonstration]:
+def read_demonstrations(folder: Path, tool: str, first: int = 0) -> list[Demonstration]:
     """Return the moves of a data set that grasped their object with a tool, in order.
 
     Args:
         folder: Folder that `drake-clutter record` wrote.
         tool: Name of the tool.
+        first: Number of the first episode that is read.
 
     Raises:
         InputError: The folder has no such moves, or they are of several cells.
     """
-    paths = sorted((folder / "episodes").glob("*.h5"))
+    paths = sorted((folder / "episodes").glob("*.h5"))[first:]
     catalog = load_catalog()
     demonstrations = list[Demonstration]()
     for path in paths:
@@ -189,43 +191,37 @@ def read_demonstrations(folder: Path, tool: str) -> list[Demonstration]:
 
 
 def split(
-    demonstrations: Sequence[Demonstration], num_held_out: int
+    demonstrations: Sequence[Demonstration], num_validation: int
 ) -> tuple[list[Demonstration], list[Demonstration]]:
-    """Return training and held-out moves; no scene is in both.
+    """Return training and validation moves; no scene is in both.
 
     Episodes go through the scenes of a data set again and again. Moves of earlier episodes with the
-    scenes of held-out moves are left out.
+    scenes of validation moves are left out.
 
     Args:
         demonstrations: Moves in the order of their episodes.
-        num_held_out: Number of the last moves, which are not learned from.
+        num_validation: Number of the last moves, which are not learned from.
 
     Raises:
         InputError: There are not enough moves.
     """
-    if len(demonstrations) < 2 * num_held_out:
-        found = f"held_out: {num_held_out} of {len(demonstrations)} moves"
+    if len(demonstrations) < 2 * num_validation:
+        found = f"validation: {num_validation} of {len(demonstrations)} moves"
         raise InputError(f"{found}; expected at most half of them")
-    held_out = list(demonstrations[-num_held_out:])
-    scenes = {d.scene_name for d in held_out}
-    return [d for d in demonstrations if d.scene_name not in scenes], held_out
+    validation = list(demonstrations[-num_validation:])
+    scenes = {d.scene_name for d in validation}
+    return [d for d in demonstrations if d.scene_name not in scenes], validation
 
 
-class ToolKinematics:
-    """Position and axis of a tool from joint angles."""
+def common_branch(demonstrations: Sequence[Demonstration]) -> list[Demonstration]:
+    """Return the demonstrations that end in the most common branch of the inverse kinematics.
 
-    def __init__(self, cell: WorkCell, tool: str) -> None:
-        """Load the robot.
+    The mean of two branches, such as a wrist that is turned to either side, leads to neither.
 
-        Args:
-            cell: Work cell.
-            tool: Name of the tool.
-        """
-        self.robot = load_robot(cell.robot)
-        self._X_TB = self.robot.X_TB.GetAsMatrix4()
-        self._X_FG = cell.gripper.tools[tool].X_FG.GetAsMatrix4()
-
-    def pose(self, q: Floats) -> tuple[Floats, Floats]:
-        """Return p_TG [m] and the z axis of G in T, shapes (..., 3), at angles (..., n)."""
-        X_TG = self._X_TB @ self.robot.forward_kinematics(np.ascontiguousarray(q)) @ self._X_FG
-        return X_TG[..., :3, 3], X_TG[..., :3, 2]
+    Args:
+        demonstrations: Demonstrations of one robot.
+    """
+    # The first joint turns the arm to the target, the last one the tool about its axis.
+    ends = np.array([d.q[-1, 1:-1] for d in demonstrations])
+    is_near = np.abs(ends - np.median(ends, axis=0)).max(axis=1) <= BRANCH_RADIUS
+    return [d for d, near in zip(demonstrations, is_near, strict=True) if near]

@@ -16,9 +16,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from drake_clutter.learning.checkpoint import load_learner, save_learner
+from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.seeding import item_rng
 from drake_clutter.validation import Count, Flag, NonEmptyText, Positive, Seed, config_class
-from training.reaching_demonstrations import Demonstration, ToolKinematics
+from training.reaching_demonstrations import Demonstration
 from training.reaching_policy import LOOKAHEAD, ReachingPolicy
 
 Floats = NDArray[np.float64]
@@ -37,7 +38,7 @@ class CloningConfig:
         data: Folder that `drake-clutter record` wrote.
         tool: Name of the tool whose moves are learned; it must be on the axis of the last joint.
         observation: Where the target comes from: `state` or `depth`.
-        held_out: Number of the last moves, whose scenes are not learned from.
+        validation: Number of the last moves, whose scenes are not learned from.
         seed: Random seed.
         steps: Number of batches.
         batch_size: States in a batch.
@@ -46,10 +47,10 @@ class CloningConfig:
         evaluate_every: Steps between two evaluations.
     """
 
-    data: str = "runs/sg_star_25_moves"
+    data: str = "runs/train_sg_star_moves"
     tool: NonEmptyText = "large"
     observation: Literal["state", "depth"] = "state"
-    held_out: Count = 100
+    validation: Count = 100
     seed: Seed = 0
     steps: Count = 6000
     batch_size: Count = 256
@@ -183,7 +184,7 @@ class StateSampler:
         self._index = np.array(index)
         self._first = np.searchsorted(self._index, np.arange(len(demonstrations) + 1))
         self._targets = np.array([d.target for d in demonstrations])
-        self._ends = self._kinematics.pose(np.array([d.q[-1] for d in demonstrations]))[0]
+        self._ends = self._kinematics.pose(np.array([d.q[-1] for d in demonstrations]))[:, :3, 3]
 
     @property
     def action_scale(self) -> Floats:
@@ -210,7 +211,8 @@ class StateSampler:
 
     def _batch(self, chosen: NDArray[np.int64], q: Floats) -> StateBatch:
         index = self._index[chosen]
-        p_TG, axis = self._kinematics.pose(q)
+        X_TG = self._kinematics.pose(q)
+        p_TG, axis = X_TG[:, :3, 3], X_TG[:, :3, 2]
         change = (self._waypoints[chosen] - q)[:, :-1]
         arrays = (q, p_TG, axis, self._targets[index], self._ends[index], change)
         tensors = [torch.from_numpy(array.astype(np.float32)) for array in arrays]

@@ -14,10 +14,12 @@ from torch import Tensor
 
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.planning.arm_dynamics import arm_dynamics
+from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.scenes.scene import Scene
 from drake_clutter.station.clutter_station import ClutterStation
-from training.reaching_demonstrations import Demonstration, ToolKinematics, object_target
+from drake_clutter.station.station_simulation import TIME_STEP
+from training.reaching_demonstrations import Demonstration, object_target
 from training.reaching_policy import LOOKAHEAD, ReachingPolicy
 
 Floats = NDArray[np.float64]
@@ -34,8 +36,6 @@ NUM_STOPS = 5
 """Number of successive actions below `STOP_CHANGE` at which the policy has stopped."""
 MAX_DISPLACEMENT = 0.010
 """Largest displacement of the picked object in a playback that reaches it [m]."""
-TIME_STEP = 0.0025
-"""Time step of the plant [s]."""
 
 
 class Controller:
@@ -64,11 +64,13 @@ class Controller:
             q: Joint angles [rad]. Shape (n,).
             scene: Scene, for a policy that sees the state.
         """
-        p_TG, axis = self._kinematics.pose(q)
+        X_TG = self._kinematics.pose(q)
         target = self._seen
         if target is None:
             target = torch.from_numpy(object_target(scene, self._pick)[None].astype(np.float32))
-        inputs = [torch.from_numpy(x[None].astype(np.float32)) for x in (q, p_TG, axis)]
+        inputs = [
+            torch.from_numpy(x[None].astype(np.float32)) for x in (q, X_TG[:3, 3], X_TG[:3, 2])
+        ]
         with torch.inference_mode():
             change = self._policy(*inputs, target)[0].double().numpy()
         return np.append(change, 0.0)
@@ -143,7 +145,7 @@ def play(policy: ReachingPolicy, demonstration: Demonstration) -> Playback:
             simulator.AdvanceTo(simulator.get_context().get_time() + COMMAND_PERIOD)
     X_OG = station.tool_pose_in_object(context, d.tool, d.pick)
     X_TG = station.arm.tools[d.tool].CalcPoseInWorld(context)
-    end, _ = ToolKinematics(d.cell, d.tool).pose(d.q[-1])
+    end = ToolKinematics(d.cell, d.tool).pose(d.q[-1])[:3, 3]
     final = d.scene.with_poses(station.scene_plant.poses(context))
     offset = final[d.pick].X_TO.p - scene_object.X_TO.p
     axis = X_TG.rotation().matrix()[:, 2]

@@ -21,8 +21,18 @@ LOOKAHEAD = 0.2
 """Time to the waypoint that the policy predicts [s]."""
 
 
+def _turn(vectors: Tensor, angle: Tensor) -> Tensor:
+    """Return vectors (b, 3) that are turned about z by angles [rad] (b,)."""
+    x, y, z = vectors.unbind(dim=1)
+    c, s = angle.cos(), angle.sin()
+    return torch.stack([c * x - s * y, s * x + c * y, z], dim=1)
+
+
 class ReachingPolicy(nn.Module):
     """Network from joint angles, tool pose and target to the change of the joint angles.
+
+    The first joint turns the arm about the vertical, so positions are seen in a frame that turns
+    with it: a demonstration shows how to reach targets at the same distance in all directions.
 
     Attributes:
         observation: `state` or `depth`.
@@ -46,7 +56,7 @@ class ReachingPolicy(nn.Module):
         )
         size = 256
         self.head = nn.Sequential(
-            nn.Linear(num_joints - 1 + 4 + 3 * 3 + 2 * 2, size),
+            nn.Linear(num_joints - 2 + 4 + 3 * 3 + 2 * 2, size),
             nn.SiLU(),
             nn.Linear(size, size),
             nn.SiLU(),
@@ -56,6 +66,8 @@ class ReachingPolicy(nn.Module):
         )
         self.action_scale: Tensor
         self.register_buffer("action_scale", torch.full((num_joints - 1,), 0.1))
+        self.base: Tensor
+        self.register_buffer("base", torch.zeros(3))
 
     def find_target(self, images: Tensor) -> Tensor:
         """Return the target, of which the point is attended to. Shape (b, 4).
@@ -86,11 +98,12 @@ class ReachingPolicy(nn.Module):
             axis: Axis of the tool in T. Shape (b, 3).
             target: Point to reach and rise of its neighbors [m]. Shape (b, 4).
         """
-        offset = target[:, :3] - p_TG
-        tilt = axis[:, :2]
+        offset = _turn(target[:, :3] - p_TG, -q[:, 0])
+        tilt = _turn(axis, -q[:, 0])[:, :2]
         features = [
-            q[:, :-1] / 2,
-            target / 0.3,
+            q[:, 1:-1] / 2,
+            _turn(target[:, :3] - self.base, -q[:, 0]) / 0.3,
+            target[:, 3:] / 0.3,
             offset / 0.5,
             torch.tanh(offset / 0.05),
             torch.tanh(offset / 0.01),

@@ -1,9 +1,13 @@
-"""Clone a policy that reaches for a pick from recorded moves, and play it back in the station.
+r"""Clone a policy that reaches for a pick from recorded moves, and play it back in the station.
 
+    drake-clutter record --scenes training/scenes/train_sg_star.json --policy random \
+        --episodes 420 --max-moves 5 --rate 30 --cameras overhead --channels depth,segmentation \
+        --resolution 320x240 --workers 2 --out runs/train_sg_star_moves
     python training/record_sg_star_dataset.py --workers 2 --out runs/sg_star_25_moves
     python training/train_bc.py train --set observation=state --out runs/bc_state
     python training/train_bc.py train --set observation=depth --out runs/bc_depth
-    python training/train_bc.py evaluate runs/bc_state runs/bc_depth --out runs/bc.json
+    python training/train_bc.py evaluate runs/bc_state runs/bc_depth \
+        --data runs/sg_star_25_moves --first 150 --out runs/bc.json
 
 The policy sees the joint angles and a target: the top of the picked object, and how far its
 neighbors rise above it, from the state of the scene or from the overhead depth image with the mask
@@ -15,7 +19,7 @@ the last joint, about the cup's axis, is not changed.
 Frames: T is the support, G is the tool, z out of it, O is the picked object.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,11 +28,18 @@ import numpy as np
 import torch
 import typer
 
+from drake_clutter.files import InputError
 from drake_clutter.learning.checkpoint import load_checkpoint
 from drake_clutter.learning.training_run import TrainingRun
+from drake_clutter.robots.robot_model import load_robot
 from drake_clutter.statistics import wilson_interval
-from drake_clutter.validation import load_config_as
-from training.reaching_demonstrations import Demonstration, read_demonstrations, split
+from drake_clutter.validation import load_config_as, to_plain
+from training.reaching_demonstrations import (
+    Demonstration,
+    common_branch,
+    read_demonstrations,
+    split,
+)
 from training.reaching_learner import CloningConfig, CloningLearner, StateSampler, relative_error
 from training.reaching_playback import (
     CONTROL_PERIOD,
@@ -64,21 +75,25 @@ def train(
     training = load_config_as(CONFIG, config, settings or ())
     torch.manual_seed(training.seed)
     demonstrations = read_demonstrations(Path(training.data), training.tool)
-    learned, held_out = split(_usable(demonstrations, training), training.held_out)
+    learned, validation = split(_usable(demonstrations, training), training.validation)
+    learned = common_branch(learned)
     num_joints = learned[0].q.shape[1]
     network = ReachingPolicy(training.observation, num_joints)
     learner = CloningLearner(network, learned, training)
     scale = StateSampler(learned, perturb=False).action_scale
     network.action_scale.copy_(torch.from_numpy(scale))
+    base = load_robot(learned[0].cell.robot).X_TB.translation()
+    network.base.copy_(torch.from_numpy(base))
     run = TrainingRun(out, training, learner, training.steps, steps_field="steps")
     metadata = {
         "kind": CHECKPOINT_KIND,
         "observation": training.observation,
         "num_joints": num_joints,
         "moves": len(learned),
+        "scenes": sorted({d.scene_name for d in (*learned, *validation)}),
     }
-    shown = StateSampler(held_out, perturb=False).all_states()
-    images = [d.image for d in held_out if d.image is not None]
+    shown = StateSampler(validation, perturb=False).all_states()
+    images = [d.image for d in validation if d.image is not None]
 
     def evaluate() -> tuple[Metrics, Metrics]:
         with torch.inference_mode():
@@ -88,13 +103,13 @@ def train(
             change = network(shown.q, shown.p_TG, shown.axis, target)
             error = relative_error(change, shown.change).mean()
             distance = (target[:, :3] - shown.end).norm(dim=1).median()
-        return {"held_out": float(error), "target_mm": 1000 * float(distance)}, learner.losses
+        return {"validation": float(error), "target_mm": 1000 * float(distance)}, learner.losses
 
     train_to_end(
         run,
         learner,
         training.steps,
-        CheckpointSpec(CHECKPOINT, metadata, lambda metrics: -metrics["held_out"]),
+        CheckpointSpec(CHECKPOINT, metadata, lambda metrics: -metrics["validation"]),
         train_iteration=learner.train_iteration,
         evaluate=evaluate,
         evaluate_every=training.evaluate_every,
@@ -116,39 +131,78 @@ def load_run(folder: Path) -> tuple[ReachingPolicy, CloningConfig, Mapping[str, 
     return ReachingPolicy.load(folder / CHECKPOINT), settings, metadata
 
 
-class Player:
-    """Plays held-out moves; a worker for `map_ordered`."""
+def held_out_moves(
+    data: Path, tool: str, first: int, count: int, seen: Collection[str]
+) -> list[Demonstration]:
+    """Return moves that policies are evaluated with, whatever they observe.
 
-    def __init__(self, folder: Path) -> None:
+    Args:
+        data: Folder of the data set.
+        tool: Name of the tool.
+        first: Number of the first episode.
+        count: Number of moves.
+        seen: Names of the scenes of training and validation.
+
+    Raises:
+        InputError: The data set does not have as many moves, or the scene of a move was seen.
+    """
+    moves = [d for d in read_demonstrations(data, tool, first) if d.image is not None]
+    if len(moves) < count:
+        found = f"--count {count}: {data} has {len(moves)} moves with images from episode {first}"
+        raise InputError(f"{found} on; expected at least as many")
+    if both := {move.scene_name for move in moves[:count]}.intersection(seen):
+        raise InputError(f"--data {data}: scene {min(both)} was learned; expected other scenes")
+    return moves[:count]
+
+
+class Player:
+    """Plays moves of which a policy has not learned; a worker for `map_ordered`."""
+
+    def __init__(self, folder: Path, data: Path, first: int, count: int) -> None:
         """Load policy and moves.
 
         Args:
             folder: Folder of a run.
+            data: See `held_out_moves`.
+            first: See `held_out_moves`.
+            count: See `held_out_moves`.
         """
         torch.set_num_threads(1)
-        self._policy, config, _ = load_run(folder)
-        demonstrations = _usable(read_demonstrations(Path(config.data), config.tool), config)
-        self._held_out = split(demonstrations, config.held_out)[1]
+        self._policy, config, metadata = load_run(folder)
+        self._moves = held_out_moves(data, config.tool, first, count, metadata["scenes"])
 
     def __call__(self, number: int) -> Playback:
-        """Return the record of a held-out move."""
-        return play(self._policy, self._held_out[number])
+        """Return the record of a move."""
+        return play(self._policy, self._moves[number])
 
 
 def evaluate(
     runs: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Folders of runs.")],
+    data: Annotated[
+        Path, typer.Option(metavar="DIR", help="Recorded data set of scenes of their own.")
+    ],
+    first: Annotated[
+        int, typer.Option(min=0, help="Number of the first episode whose moves are played.")
+    ] = 0,
+    count: Annotated[int, typer.Option(min=1, help="Number of moves.")] = 100,
     out: ResultsOption = None,
     workers: WorkersOption = 1,
 ) -> None:
-    """Play the held-out moves in the station and write how many reach their pick."""
+    """Play held-out moves in the station and write how many reach their pick."""
     rows = list[Row]()
     for folder in runs:
         _, config, metadata = load_run(folder)
         records = collect_records(
             folder / "playbacks.jsonl",
-            {"policy": metadata["commits"], "steps": config.steps, "seed": config.seed},
-            partial(Player, folder),
-            range(config.held_out),
+            {
+                "policy": metadata["commits"],
+                "steps": config.steps,
+                "seed": config.seed,
+                "data": str(data),
+                "first": first,
+            },
+            partial(Player, folder, data, first, count),
+            range(count),
             schema=Playback,
             workers=workers,
         )
@@ -156,8 +210,7 @@ def evaluate(
         rows.append(
             {
                 "observation": config.observation,
-                "tool": config.tool,
-                "data": config.data,
+                "config": to_plain(config),
                 "seed": config.seed,
                 "moves": metadata["moves"],
                 "held_out": len(records),
@@ -170,6 +223,8 @@ def evaluate(
             }
         )
     header = {
+        "data": str(data),
+        "first_episode": first,
         "lookahead_s": LOOKAHEAD,
         "control_period_s": CONTROL_PERIOD,
         "time_limit_s": TIME_LIMIT,

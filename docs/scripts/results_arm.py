@@ -383,17 +383,20 @@ def _cups() -> str:
 
 def _cloning() -> str:
     results = read_training_results(CLONING)
+    config = results["rows"][0]["config"]
     text = section(
         "Policies cloned from recorded moves",
         "Networks that reach for a given object from home, cloned from the recorded approaches of "
         "a data set ([how to train them](../how_to/train_networks.md#reaching-policy)), control "
         f"the arm in the station at {1 / results['control_period_s']:g} Hz. *State*: sees the "
         "position of the object. *Depth*: sees the overhead depth image and the mask of the "
-        f"object. They learn from moves with the tool `{results['rows'][0]['tool']}`. *Reached*: "
-        "the policy ends where the cup can attach to the object, which has not "
-        f"moved by more than {results['max_displacement_mm']:g} mm. Held-out moves are of other "
-        "scenes.",
-        command="python training/train_bc.py evaluate runs/bc_state runs/bc_depth --out FILE",
+        f"object. They learn from moves of `{config['data']}` with the tool `{config['tool']}`. "
+        f"Held-out moves are of `{results['data']}` from episode {results['first_episode']} on, "
+        "whose scenes are not among those of training or validation. *Reached*: the policy ends "
+        "where the cup can attach to the object, which has not moved by more than "
+        f"{results['max_displacement_mm']:g} mm.",
+        command="python training/train_bc.py evaluate runs/bc_state runs/bc_depth "
+        f"--data {results['data']} --first {results['first_episode']} --out FILE",
         seed=", ".join(str(seed) for seed in sorted({row["seed"] for row in results["rows"]})),
         results=[f"training/results/{CLONING}"],
     )
