@@ -215,8 +215,8 @@ def test_unusable_setups_have_a_reason() -> None:
     assert reason("robot.base.x=-0.2") == "the base stands in the support"
     assert reason("robot.base.x=-5") == "no part of the support is in reach"
     crate = '{"name": "crate", "box": [0.4, 0.4, 0.6], "pose": {"translation": [-0.65, 0, 0.6]}}'
-    clears_nothing = "no part of the support is in reach"
-    assert reason(f"fixtures=[{crate}]") == clears_nothing, "the arm is in a crate"
+    in_crate = "in collision wherever the support is in reach: upper_arm and crate"
+    assert reason(f"fixtures=[{crate}]") == in_crate
     cell = load_cell(resource_path("models/cells/iiwa14_epick_tray.yaml"))
     spec = cell.robot.model_copy(update={"ik": "ur"})
     request = SetupRequest(cell.model_copy(update={"robot": spec}))

@@ -102,9 +102,11 @@ class HomeSearch:
         if keep and obstacle is None:
             return Home(tuple(given.tolist()), is_given=True)
         blocking = "" if obstacle is None else " and ".join(obstacle.pair)
-        work, alternatives = self._work_configurations()
+        work, alternatives, collision = self._work_configurations()
         if not len(work):
-            return "no part of the support is in reach"
+            if collision is None:
+                return "no part of the support is in reach"
+            return f"in collision wherever the support is in reach: {' and '.join(collision.pair)}"
         candidates = self._candidates()
         times = min_travel_time(candidates[:, None] - work[None], self._robot).mean(axis=1)
         best: list[Floats] = []
@@ -125,32 +127,41 @@ class HomeSearch:
     def _count_connected(self, home: Floats, work: Floats) -> int:
         return sum(self._is_connected(home, q) for q in work)
 
-    def _work_configurations(self) -> tuple[Floats, Floats]:
-        """Return configurations of a downward tool above the support. Shapes (k, n).
+    def _work_configurations(self) -> tuple[Floats, Floats, SignedDistance | None]:
+        """Return configurations of a downward tool above the support.
 
-        For each position the first is the solution closest to the middle of the joint ranges that
-        is clear of the cell; the others, which objects in the way of the first call for, are clear
-        solutions of other branches.
+        Returns:
+            For each position the solution closest to the middle of the joint ranges that is clear
+            of the cell, shape (k, n); the clear solutions of other branches, which objects in the
+            way of the first call for, shape (m, n); and a collision of a solution that is not
+            clear, if there is one.
         """
         x, y = 0.6 * self._cell.support.half_size
         middle = self._robot.position_limits.mean(axis=1)
         found, others = [], []
+        collision = None
         for px, py in ((0.0, 0.0), (-x, -y), (-x, y), (x, -y), (x, y)):
             for pz in _WORK_HEIGHTS:
                 poses = [downward_pose(yaw, np.array([px, py, pz])) for yaw in _WORK_YAWS]
                 q = self._tool.solve_ik(np.array(poses)).reshape(-1, self._robot.num_joints)
                 q = self._robot.unwrap(q[np.isfinite(q[:, 0])], middle)
                 q = q[np.argsort(np.abs(q - middle).max(axis=1), kind="stable")]
-                clear = [row for row in q if self._is_clear_of_cell(row)]
+                collisions = [self._find_collision(row) for row in q]
+                clear = [row for row, pair in zip(q, collisions, strict=True) if pair is None]
+                collision = next((pair for pair in (collision, *collisions) if pair), None)
                 found += clear[:1]
                 others += clear[1:]
         shape = -1, self._robot.num_joints
-        return np.array(found).reshape(shape), np.array(others).reshape(shape)
+        return np.array(found).reshape(shape), np.array(others).reshape(shape), collision
 
-    def _is_clear_of_cell(self, q: Floats) -> bool:
-        """Return whether the arm is clear of all but the camera's view."""
+    def _find_collision(self, q: Floats) -> SignedDistance | None:
+        """Return the closest bodies but the camera's view, if the planner does not allow it."""
         pairs = self._collision_model.distances_below(q, PlannerConfig().min_distance)
-        return all(VIEW in pair.pair for pair in pairs)
+        return min(
+            (pair for pair in pairs if VIEW not in pair.pair),
+            key=lambda pair: pair.distance,
+            default=None,
+        )
 
     def _candidates(self) -> Floats:
         """Return clear configurations within joint and half the torque limits. Shape (m, n)."""
