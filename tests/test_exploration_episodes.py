@@ -264,6 +264,16 @@ def test_an_episode_can_continue_after_all_objects_were_found_but_not_after_a_co
         assert len(task.transitions) == made
 
 
+def test_the_number_of_moves_also_limits_an_episode_that_continues_after_all_was_found(
+    detector: LabelDetector,
+) -> None:
+    game = episode(detector, *[MoveResult.PLACED] * 5)
+    moves = [Move(f"cover {1 + k % 2}") for k in range(5)]
+    task = run_episode(game.backend, scripted(*moves), max_moves=3, until=StopCriterion.LAST_MOVE)
+    assert [step.move for step in task.transitions] == moves[:3]
+    assert task.has_found_all
+
+
 # --- Belief ---
 
 

@@ -108,7 +108,7 @@ def run_episode(
         (None, TerminationReason.ALL_FOUND) if until is StopCriterion.LAST_MOVE else (None,)
     )
     attempts = backend.rollout(policy)
-    while task.termination in nonterminal:
+    while task.termination in nonterminal and len(task.transitions) < max_moves:
         try:
             attempt = next(attempts)
         except StopIteration as end:
