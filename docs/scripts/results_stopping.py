@@ -14,9 +14,10 @@ def stopping() -> str:
         "is known; at most 20 moves. "
         "*Right*: stopped with every object found, of all episodes. *Too early*: stopped with an "
         "object hidden. *Unneeded moves*: after every object was in view, mean of the episodes in "
-        "which it was. Detector `labels` is perfect. Intervals are 95 %.",
+        "which it was. Detector `labels` is perfect. `--first` and `--count` are the first scene "
+        "and the number of scenes. Intervals are 95 %.",
         command="python benchmarks/stopping.py episodes --set DATASET --agent POLICY "
-        "--fidelity static_or_drake --first FIRST --count SCENES --out FILE",
+        "--fidelity static_or_drake --out FILE",
         seed=results["seed"],
         results=["benchmarks/results/stopping.json", "benchmarks/results/hidden_rates.json"],
     )
