@@ -29,7 +29,7 @@ from drake_clutter.planning.pick_place_plan import (
     plan_to_dict,
 )
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
-from drake_clutter.planning.planner_config import PlannerConfig
+from drake_clutter.planning.planner_config import ANY_OVERLAP, PlannerConfig
 from drake_clutter.reports.filmstrip import (
     render_filmstrip,
     rotation_to_base_side,
@@ -270,7 +270,8 @@ def test_an_object_of_unknown_height_is_lowered_until_contact(
     X_TO = Pose(
         (0.2, -0.2, taken_for.X_TO.translation[2] + too_tall + 0.003), taken_for.X_TO.quaternion
     )
-    guarded = PickPlacePlanner(DEFAULT_CELL, PlannerConfig(max_guarded_descent=0.08))
+    config = PlannerConfig(max_guarded_descent=0.08, max_overlap=ANY_OVERLAP)
+    guarded = PickPlacePlanner(DEFAULT_CELL, config)
     plan = guarded.plan([taken_for], taken_for.name, X_TO)
     assert isinstance(plan, PickPlacePlan)
     simulation = StationSimulation(DEFAULT_CELL, scene_of(stands))

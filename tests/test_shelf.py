@@ -104,7 +104,7 @@ def test_the_arm_reaches_in_or_gives_a_reason(
     """A box is moved under a high board; under a low one, the arm would collide."""
     world = load_config_as(shelf, settings=[f"cell.fixtures.1.pose.z={board}"])
     picked = resting("pudding_box", xy=(-0.05, 0.1))
-    scene = Scene((picked, resting("cracker_box", xy=(0.1, -0.2))), world.cell.support)
+    scene = Scene((picked, resting("cracker_box", xy=(0.08, -0.2))), world.cell.support)
     X_TO_place = picked.X_TO.translated((0.02, -0.12, 0.001))
     command = PickPlaceCommand(Move(picked.name), picked.X_TO, X_TO_place)
     executor = ArmExecutor(world, planner_config=PlannerConfig(optimize=False))

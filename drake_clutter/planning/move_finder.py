@@ -115,9 +115,6 @@ class MoveFinder:
             excluded: Grasps that are left out.
         """
         start_time = time.perf_counter()
-        model = self.collision_model(state.objects, occluded)
-        if failure := check_overlaps(model, state.objects, self.config.max_overlap):
-            return failure
         if carried := objects_resting_on(goal.picked, state.objects):
             return PlanningFailure(PlanningFailureReason.CARRIES_OTHERS, ", ".join(carried))
         if grasp is None:
@@ -132,6 +129,9 @@ class MoveFinder:
             if isinstance(verified, PlanningFailure):
                 return verified
             candidates = [verified]
+        model = self.collision_model(state.objects, occluded)
+        if failure := check_overlaps(model, state.objects, self.config.max_overlap):
+            return failure
         failure = self._check_endpoints(state, goal, model)
         if failure is not None:
             return failure
