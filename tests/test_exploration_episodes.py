@@ -22,13 +22,14 @@ from drake_clutter.scenes.interfaces import (
     InstabilityReason,
     Move,
     MoveExecutor,
+    MovePart,
     MoveResult,
     Observation,
     Outcome,
     PickPlaceCommand,
 )
 from drake_clutter.scenes.scene import TRAY, Pose, Scene
-from drake_clutter.tasks.belief import Belief, Decision, Policy, legal_moves
+from drake_clutter.tasks.belief import Belief, Decision, Policy, legal_moves, select_move
 from drake_clutter.tasks.episode import SteppedBackend, make_teleport_backend_factory, run_episode
 from drake_clutter.tasks.exploration_task import (
     ExplorationTask,
@@ -287,6 +288,84 @@ def test_invalid_moves_are_cleared_by_a_change(detector: LabelDetector) -> None:
         invalid.append(game.backend.belief.invalid_moves)
     assert invalid == [(one,), (one, two), (), (two,), ()]
     assert game.backend.belief.history == (one, two, one, two, two)
+
+
+PICK, CARRY, PLACE = MovePart.PICK, MovePart.CARRY, MovePart.PLACE
+
+
+def first_valid(belief: Belief, observation: Observation, rng: np.random.Generator) -> Decision:
+    """Choose the first move that is not invalid, by the order of the objects, then the tray."""
+    names = sorted(d.name for d in observation.detections)
+    moves = [Move(x, y) for x in names for y in (TRAY, *names) if y != x]
+    return Decision(next((move for move in moves if move not in belief.invalid_moves), None))
+
+
+@pytest.mark.parametrize(
+    ("parts", "moves"),
+    [
+        ([PICK, PICK, PICK], ["cover 1", "cover 2", "marker"]),
+        ([CARRY, CARRY, CARRY, CARRY], ["cover 1", "cover 1", "cover 2", "cover 2"]),
+        ([CARRY, PICK, PLACE, PLACE], ["cover 1", "cover 1", "cover 2", "cover 2"]),
+        ([PLACE, PLACE, PLACE, PICK], ["cover 1", "cover 1", "cover 1", "cover 2"]),
+        ([None, None, None, PICK], ["cover 1", "cover 1", "cover 1", "cover 2"]),
+    ],
+)
+def test_what_is_tried_after_a_move_without_a_plan(
+    parts: list[MovePart | None], moves: list[str], detector: LabelDetector
+) -> None:
+    """Another object after a failed pick, one other place after a carry; no move twice."""
+    observation = detector.perceive(HIDING).observation
+    belief = Belief().update(observation)
+    tried = list[Move]()
+    for part in parts:
+        move = select_move(first_valid, belief, observation, rng()).move
+        assert move is not None
+        tried.append(move)
+        belief = belief.record(move, MoveResult.NOT_PLANNED, failed_part=part).update(observation)
+    assert [move.pick for move in tried] == moves
+    assert len(set(tried)) == len(tried)
+
+
+def test_a_failed_pick_is_tried_again_when_nothing_else_is_left(detector: LabelDetector) -> None:
+    observation = detector.perceive(HIDING).observation
+    belief = Belief().update(observation)
+    legal = legal_moves(observation)
+    tried = list[Move]()
+    while (move := select_move(first_valid, belief, observation, rng()).move) is not None:
+        tried.append(move)
+        belief = belief.record(move, MoveResult.NOT_PLANNED, failed_part=PICK).update(observation)
+    assert [move.pick for move in tried[:4]] == ["cover 1", "cover 2", "marker", "cover 1"]
+    assert sorted(map(str, tried)) == sorted(map(str, legal))
+
+
+def test_a_failed_pick_counts_until_something_has_changed(detector: LabelDetector) -> None:
+    observation = detector.perceive(HIDING).observation
+    failed = Belief().update(observation)
+    failed = failed.record(Move("cover 1"), MoveResult.NOT_PLANNED, failed_part=PICK)
+    assert {m.pick for m in failed.update(observation).deferred_moves(observation)} == {"cover 1"}
+    shifted = HIDING["cover 1"].X_TO.translated((0.02, 0.0, 0.0))
+    other_belief = detector.perceive(HIDING.with_poses({"cover 1": shifted})).observation
+    assert failed.update(other_belief).deferred_moves(other_belief) == []
+    assert failed.record(Move("cover 2"), MoveResult.DROPPED).failures == ()
+    aside = resting("cracker_box", xy=ASIDE["cover 2"]).X_TO
+    moved = detector.perceive(HIDING.with_poses({"cover 2": aside})).observation
+    assert failed.record(Move("cover 2"), MoveResult.PLACED, aside).update(moved).failures == ()
+    stuck = failed.record(Move("cover 2"), MoveResult.PLACED, aside).update(observation)
+    assert stuck.failures == failed.failures, "nothing has moved"
+
+
+def test_a_policy_that_stops_is_not_asked_again(detector: LabelDetector) -> None:
+    observation = detector.perceive(HIDING).observation
+    belief = Belief().update(observation)
+    belief = belief.record(Move("cover 1"), MoveResult.NOT_PLANNED, failed_part=PICK)
+    asked = list[Belief]()
+
+    def stop(known: Belief, *_: object) -> Decision:
+        asked.append(known)
+        return Decision(None, is_stop=True)
+
+    assert select_move(stop, belief, observation, rng()).is_stop
+    assert len(asked) == 1
 
 
 def test_an_object_detected_at_its_old_pose_was_not_placed(detector: LabelDetector) -> None:

@@ -20,6 +20,7 @@ from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.scenes.geometry import objects_resting_on
+from drake_clutter.scenes.interfaces import MovePart
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.scene_plant import rigid_transform
 from drake_clutter.validation import to_plain, validate
@@ -145,6 +146,11 @@ def reason(found: PickPlacePlan | PlanningFailure) -> PlanningFailureReason:
     return found.reason
 
 
+def failed_part(found: PickPlacePlan | PlanningFailure) -> MovePart | None:
+    assert isinstance(found, PlanningFailure)
+    return found.failed_part
+
+
 def test_a_marker_does_not_seal_on_a_large_cup() -> None:
     marker = SceneObject("marker", CLASSES["large_marker"], Pose((0.0, 0.0, 0.009), LYING))
     found = planner(cell_with(ONE_CUP)).plan([marker], "marker", Pose((0.1, 0.1, 0.01), LYING))
@@ -152,6 +158,7 @@ def test_a_marker_does_not_seal_on_a_large_cup() -> None:
     assert isinstance(found, PlanningFailure)
     assert found.value > 0.001
     assert str(found) == "no seal: marker"
+    assert found.failed_part is MovePart.PICK
 
 
 def test_an_object_with_others_on_top_is_not_picked() -> None:
@@ -159,6 +166,7 @@ def test_an_object_with_others_on_top_is_not_picked() -> None:
     assert reason(found) is PlanningFailureReason.CARRIES_OTHERS
     assert isinstance(found, PlanningFailure)
     assert found.detail == "gelatin_box"
+    assert found.failed_part is MovePart.PICK
     assert objects_resting_on(PILE[3], PILE) == ()
 
 
@@ -183,12 +191,14 @@ def test_poses_may_be_out_of_reach() -> None:
         PlanningFailureReason.UNREACHABLE,
         "unreachable: the grasp",
     )
+    assert failed_part(found) is MovePart.PICK
     nearer = cell_with("robot.base.x=-1.15")
     found = planner(nearer).plan(PILE, "cracker_box", place_pose(PILE[2], 0.26, -0.3))
     assert (reason(found), str(found)) == (
         PlanningFailureReason.UNREACHABLE,
         "unreachable: the place",
     )
+    assert failed_part(found) is MovePart.PLACE
 
 
 def test_neighbors_may_block_every_grasp() -> None:
@@ -203,6 +213,7 @@ def test_neighbors_may_block_every_grasp() -> None:
     assert reason(found) is PlanningFailureReason.IN_COLLISION
     assert isinstance(found, PlanningFailure)
     assert "at the grasp" in found.detail
+    assert found.failed_part is MovePart.PICK
     assert found.value < PlannerConfig().min_distance
     assert not planner().are_endpoints_reachable([low, *walls], "low", place_pose(low, 0.2, -0.2))
 
@@ -212,6 +223,7 @@ def test_planning_may_time_out() -> None:
         PILE, "sugar_box", place_pose(PILE[0], 0.2, -0.2)
     )
     assert reason(found) is PlanningFailureReason.TIME_OUT
+    assert failed_part(found) is MovePart.CARRY
 
 
 def test_moves_with_reachable_endpoints_are_planned() -> None:

@@ -18,6 +18,7 @@ from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.pick_place_search import MoveGoal, PickPlaceSearch
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.tool_kinematics import _MAX_POSE_STEP, WayOut, raise_pose
+from drake_clutter.scenes.interfaces import MovePart
 from drake_clutter.scenes.scene import SceneObject
 from drake_clutter.simulation.scene_plant import rigid_transform
 
@@ -105,6 +106,7 @@ def test_the_furthest_failure_is_named() -> None:
     assert isinstance(found, PlanningFailure)
     assert found.reason is PlanningFailureReason.IN_COLLISION
     assert found.detail.startswith("at the place: ")
+    assert found.failed_part is MovePart.PLACE
 
 
 def test_a_vertical_line_has_no_more_poses_than_its_steps_need() -> None:

@@ -313,6 +313,7 @@ def episode_record(task: ExplorationTask, known: Sequence[SceneObject]) -> Row:
         "recognised": len(match_to_ground_truth(known, task.scene.objects)),
         "results": dict(Counter(o.result.value for o in outcomes)),
         "not_planned": dict(Counter(detail.split(":")[0] for detail in not_planned)),
+        "failed_parts": dict(Counter(o.failed_part.value for o in outcomes if o.failed_part)),
         "collapse": collapse,
     }
 

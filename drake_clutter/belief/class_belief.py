@@ -37,6 +37,12 @@ class Touch:
     excess_height: float = math.nan
     has_sealed: bool = True
 
+    @property
+    def has_felt(self) -> bool:
+        """Whether the gripper felt a mass, a height, or that it did not grasp the object."""
+        is_measured = not (math.isnan(self.mass) and math.isnan(self.excess_height))
+        return is_measured or not self.has_sealed
+
 
 def update_probabilities(
     prior: ClassProbabilities, likelihoods: Mapping[str, float]

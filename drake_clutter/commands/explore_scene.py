@@ -319,6 +319,7 @@ def episode_to_dict(task: ExplorationTask, agent: str, fidelity: str, seed: int)
     end = task.termination or TerminationReason.GAVE_UP
     moves = []
     for number, step in enumerate(task.transitions, start=1):
+        part = step.outcome.failed_part
         moves.append(
             {
                 "action": action_name(number) if fidelity == "arm" else None,
@@ -326,6 +327,7 @@ def episode_to_dict(task: ExplorationTask, agent: str, fidelity: str, seed: int)
                 "outcome": step.outcome.result.value,
                 "instability": step.outcome.instability_text or None,
                 "detail": step.outcome.detail,
+                "failed_part": None if part is None else part.value,
                 "newly_found": list(step.newly_found),
                 "pick_probabilities": dict(step.decision.pick_probabilities),
                 "known_objects": list(step.decision.considered),

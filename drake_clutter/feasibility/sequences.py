@@ -75,7 +75,7 @@ class PlannedExecutor:
         """Plan and teleport, see `MoveExecutor.execute`."""
         plan = self._planner.plan(scene.objects, command.move.pick, command.X_TO_place)
         if isinstance(plan, PlanningFailure):
-            return Outcome(MoveResult.NOT_PLANNED, scene, detail=str(plan))
+            return plan.outcome(scene)
         self.robot_time += build_command_schedule(plan, self._planner.cell).end_time
         return self._executor.execute(scene, command, rng)
 

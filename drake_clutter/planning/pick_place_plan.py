@@ -24,7 +24,8 @@ from pydrake.trajectories import (
 from drake_clutter.cell.gripper import Payload
 from drake_clutter.planning.collision_model import SignedDistance
 from drake_clutter.planning.motion_plan import CellState, HeldObject, PlanStep, reverse, stay_at
-from drake_clutter.scenes.scene import Pose
+from drake_clutter.scenes.interfaces import MovePart, MoveResult, Outcome
+from drake_clutter.scenes.scene import Pose, Scene
 
 DESCENT_SPEED = 0.02
 """Largest speed of a guarded descent [m/s]: 0.5 mm between two contact checks of the executor."""
@@ -73,6 +74,22 @@ _UNITS = {
 }
 """Factor and unit with which the value of a failure is shown; other values have several units."""
 
+_FAILED_PARTS = {
+    PlanningFailureReason.NO_FREE_PLACEMENT: MovePart.PLACE,
+    PlanningFailureReason.NO_SEAL: MovePart.PICK,
+    PlanningFailureReason.NO_OPPOSED_FACES: MovePart.PICK,
+    PlanningFailureReason.NO_GRASP_LEFT: MovePart.PICK,
+    PlanningFailureReason.TOO_HEAVY: MovePart.PICK,
+    PlanningFailureReason.GRASP_TOO_WEAK: MovePart.PICK,
+    PlanningFailureReason.CARRIES_OTHERS: MovePart.PICK,
+    PlanningFailureReason.PLACE_IN_COLLISION: MovePart.PLACE,
+    PlanningFailureReason.PLACE_TILTED: MovePart.PLACE,
+    PlanningFailureReason.PLACE_UNSUPPORTED: MovePart.PLACE,
+    PlanningFailureReason.PLACE_OFF_BALANCE: MovePart.PLACE,
+    PlanningFailureReason.TIME_OUT: MovePart.CARRY,
+}
+"""Failed part of a move by the reason. Other reasons apply to several parts, or to the cell."""
+
 
 @dataclass(frozen=True)
 class PlanningFailure:
@@ -89,12 +106,14 @@ class PlanningFailure:
             center of mass from the contact area [m]; of a configuration the excess of a joint
             [rad]; of a weak grasp the acceleration that it bears [m/s^2]. NaN if there is none.
         planning_time: Wall time spent [s].
+        attempted_part: Part of the move at which that attempt failed; None if the reason says it.
     """
 
     reason: PlanningFailureReason
     detail: str = ""
     value: float = math.nan
     planning_time: float = 0.0
+    attempted_part: MovePart | None = None
 
     def __str__(self) -> str:
         return f"{self.reason.value}{f': {self.detail}' if self.detail else ''}"
@@ -106,11 +125,31 @@ class PlanningFailure:
 
     @property
     def quantity(self) -> str:
-        """The value with its unit; empty without one."""
-        if math.isnan(self.value) or self.reason not in _UNITS:
+        """The value with its unit; empty without one, or if it is infinite."""
+        if not math.isfinite(self.value) or self.reason not in _UNITS:
             return ""
         scale, unit = _UNITS[self.reason]
         return f"{scale * self.value:.3g} {unit}"
+
+    @property
+    def failed_part(self) -> MovePart | None:
+        """Part of the move that is not possible; None if the cell allows no move, or a transfer."""
+        return self.attempted_part or _FAILED_PARTS.get(self.reason)
+
+    def outcome(self, scene: Scene) -> Outcome:
+        """Return the outcome of the move.
+
+        Args:
+            scene: The scene, which stays as it is.
+        """
+        is_full = self.reason is PlanningFailureReason.NO_FREE_PLACEMENT
+        return Outcome(
+            MoveResult.NO_FREE_PLACEMENT if is_full else MoveResult.NOT_PLANNED,
+            scene,
+            detail="" if is_full else self.description,
+            failure_reason=self.reason.value,
+            failed_part=self.failed_part,
+        )
 
 
 class FailureLog:
@@ -122,7 +161,8 @@ class FailureLog:
 
     def __init__(self) -> None:
         """Create a log without attempts, in which no grasp is reachable."""
-        self.furthest = PlanningFailure(PlanningFailureReason.UNREACHABLE, "the grasp")
+        reason = PlanningFailureReason.UNREACHABLE
+        self.furthest = PlanningFailure(reason, "the grasp", attempted_part=MovePart.PICK)
         self._progress = -1
 
     def record(
@@ -131,6 +171,7 @@ class FailureLog:
         reason: PlanningFailureReason,
         detail: str,
         value: float = math.nan,
+        part: MovePart | None = None,
     ) -> None:
         """Record a failure as the furthest one if no earlier attempt came as far.
 
@@ -139,10 +180,11 @@ class FailureLog:
             reason: Reason of the failure.
             detail: See `PlanningFailure`.
             value: See `PlanningFailure`.
+            part: Part of the move that failed; None if the reason says it.
         """
         if progress > self._progress:
             self._progress = progress
-            self.furthest = PlanningFailure(reason, detail, value)
+            self.furthest = PlanningFailure(reason, detail, value, attempted_part=part)
 
 
 @dataclass(frozen=True)

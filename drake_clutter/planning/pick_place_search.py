@@ -43,6 +43,7 @@ from drake_clutter.planning.tool_kinematics import (
     turn_about_axis,
 )
 from drake_clutter.robots.robot_model import load_robot
+from drake_clutter.scenes.interfaces import MovePart
 from drake_clutter.scenes.scene import Pose, SceneObject
 from drake_clutter.simulation.scene_plant import rigid_transform
 
@@ -254,7 +255,8 @@ class PickPlaceSearch:
             q_pick = tool.solve_ik(X_pick)
             q_place = self._robot.ik.match(q_pick, q_place)
         if (np.isfinite(q_pick[..., 0]) & ~np.isfinite(q_place[..., 0])).any():
-            self.failures.record(0, PlanningFailureReason.UNREACHABLE, "the place")
+            reason = PlanningFailureReason.UNREACHABLE
+            self.failures.record(0, reason, "the place", part=MovePart.PLACE)
         if not self._is_held:
             q_pick = self._robot.unwrap(q_pick, self._start)
         return q_pick, self._robot.unwrap(q_place, q_pick)
@@ -316,7 +318,10 @@ class PickPlaceSearch:
         context = EndpointContext(
             candidate.tool, candidate.X_TG_pick[:2, 3], of_gripper, candidate.load_distance
         )
-        if self._checker.min_distance_along(q[None], context, 1, "at the grasp", found) is None:
+        distance = self._checker.min_distance_along(
+            q[None], context, 1, "at the grasp", MovePart.PICK, found
+        )
+        if distance is None:
             if self._checker.is_tool_in_collision:
                 self._poses_in_collision.add(pose)
             return None
@@ -342,7 +347,9 @@ class PickPlaceSearch:
         context = EndpointContext(
             candidate.tool, candidate.X_TG_place[:2, 3], allowed, candidate.load_distance
         )
-        distance = self._checker.min_distance_along(q[None], context, 2, "at the place", found)
+        distance = self._checker.min_distance_along(
+            q[None], context, 2, "at the place", MovePart.PLACE, found
+        )
         return None if distance is None else context
 
     def _bodies_below(self, placed: SceneObject) -> frozenset[str]:
@@ -402,7 +409,9 @@ class PickPlaceSearch:
             height = bottom + recess + gripper_height
             carry_path = self._carry_path(candidate, height)
             if isinstance(carry_path, str):
-                self.failures.record(3, PlanningFailureReason.UNREACHABLE, carry_path, height)
+                self.failures.record(
+                    3, PlanningFailureReason.UNREACHABLE, carry_path, height, MovePart.CARRY
+                )
                 return None
             q_end = carry_path.reversed_lowering[0]
             if place is None or (self._goal.X_TO_place and not ends_at_q_place):

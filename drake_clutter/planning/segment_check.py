@@ -20,6 +20,7 @@ from drake_clutter.planning.shape_table import FoundDistances
 from drake_clutter.planning.time_parameterization import MAX_JOINT_STEP, sample_path
 from drake_clutter.planning.tool_kinematics import ToolKinematics
 from drake_clutter.robots.robot_model import load_robot
+from drake_clutter.scenes.interfaces import MovePart
 from drake_clutter.scenes.scene import Pose, SceneObject
 
 Floats = NDArray[np.float64]
@@ -35,6 +36,15 @@ imposes distances at few points; the check afterwards is dense."""
 MAX_CARRY_TILT = math.radians(0.5)
 """Largest tilt of the gripper while it carries an object [rad]; the suction cup is planned for
 vertical loads."""
+PART_OF_SEGMENT = {
+    "approach": MovePart.PICK,
+    "carry": MovePart.CARRY,
+    "retreat": MovePart.PLACE,
+}
+"""Part of a move that a segment belongs to."""
+_MAX_LIFT_OFFSET = 0.005
+"""Up to this horizontal distance of the tool from an endpoint, a carry belongs to the endpoint [m]:
+wherever else the object goes, it is first lifted and at last lowered vertically."""
 
 
 class SegmentChecker:
@@ -110,6 +120,7 @@ class SegmentChecker:
         endpoint: EndpointContext,
         progress: int,
         stage: str,
+        part: MovePart,
         found: FoundDistances | None = None,
     ) -> SignedDistance | None:
         """Return the smallest distance along a path to obstacles that it may not touch.
@@ -119,6 +130,7 @@ class SegmentChecker:
             endpoint: Endpoint near which smaller distances are allowed.
             progress: Stage of planning, see `FailureLog.record`.
             stage: Name of the stage for the failure.
+            part: Part of the move at the endpoint.
             found: Distances along the path, if they are known.
 
         Returns:
@@ -140,11 +152,15 @@ class SegmentChecker:
                 for first, second in (found_pair.pair for found_pair in pairs)
             )
             nearest = pairs[0]
+            offset = self._offsets(endpoint, path)[found.rows[too_close[0]]]
+            if stage == "carry" and offset > _MAX_LIFT_OFFSET:
+                part = MovePart.CARRY
             self._failures.record(
                 progress,
                 PlanningFailureReason.IN_COLLISION,
                 f"{stage}: {' and '.join(nearest.pair)}",
                 nearest.distance,
+                part,
             )
             return None
         counts = (required >= min_distance) & ~model.is_to_arm(found)
@@ -166,8 +182,7 @@ class SegmentChecker:
             endpoint: Endpoint near which smaller distances are allowed.
             min_distance: Required distance of all other pairs [m]; a held object keeps more.
         """
-        p_TG = self._collision_model.tool_positions(endpoint.tool, path)
-        offsets = np.hypot(*(p_TG[:, :2] - endpoint.p_TG_xy).T)
+        offsets = self._offsets(endpoint, path)
         contacts = dict.fromkeys(self._grasp_contacts[endpoint.tool], self._config.lip_gap / 2)
         required = np.full(len(found.rows), min_distance)
         required[self._collision_model.is_of_attached(found)] += endpoint.load_distance
@@ -177,6 +192,16 @@ class SegmentChecker:
                 required[of_pair], allowed + offsets[found.rows[of_pair]]
             )
         return required
+
+    def _offsets(self, endpoint: EndpointContext, path: Floats) -> Floats:
+        """Return the horizontal distances of the tool from an endpoint [m]. Shape (m,).
+
+        Args:
+            endpoint: The endpoint.
+            path: Configurations. Shape (m, n).
+        """
+        p_TG = self._collision_model.tool_positions(endpoint.tool, path)
+        return np.asarray(np.hypot(*(p_TG[:, :2] - endpoint.p_TG_xy).T))
 
     def distances_below_object(
         self, candidate: GraspCandidate, found: FoundDistances, below: Set[str]
@@ -263,17 +288,24 @@ class SegmentChecker:
             return None
         if segment_name != "carry":
             context = arm_context(segment_name, endpoints)
-            return self.min_distance_along(points, context, progress, segment_name)
+            part = PART_OF_SEGMENT[segment_name]
+            return self.min_distance_along(points, context, progress, segment_name, part)
         slack = self.carry_columns(candidate).slack(points)
         if slack < 0:
             detail = f"carry: {self._picked.name} and what may be below it"
-            self._failures.record(progress, PlanningFailureReason.IN_COLLISION, detail, slack)
+            self._failures.record(
+                progress, PlanningFailureReason.IN_COLLISION, detail, slack, MovePart.CARRY
+            )
             return None
         half = len(points) // 2
-        from_pick = self.min_distance_along(points[:half], endpoints[0], progress, segment_name)
+        from_pick = self.min_distance_along(
+            points[:half], endpoints[0], progress, segment_name, MovePart.PICK
+        )
         if from_pick is None:
             return None
-        to_place = self.min_distance_along(points[half:], endpoints[1], progress, segment_name)
+        to_place = self.min_distance_along(
+            points[half:], endpoints[1], progress, segment_name, MovePart.PLACE
+        )
         if to_place is None:
             return None
         return min((from_pick, to_place), key=lambda distance: distance.distance)
@@ -295,7 +327,7 @@ class SegmentChecker:
         tilt = float(np.linalg.norm(axis[:, :2], axis=1).max())
         if tilt > MAX_CARRY_TILT:
             self._failures.record(
-                progress, PlanningFailureReason.TRAJECTORY_INFEASIBLE, "carry", tilt
+                progress, PlanningFailureReason.TRAJECTORY_INFEASIBLE, "carry", tilt, MovePart.CARRY
             )
         return tilt > MAX_CARRY_TILT
 

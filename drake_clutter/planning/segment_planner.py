@@ -27,6 +27,7 @@ from drake_clutter.planning.pick_place_plan import (
 from drake_clutter.planning.planner_config import PlannerConfig
 from drake_clutter.planning.segment_check import (
     OPTIMIZATION_MARGIN,
+    PART_OF_SEGMENT,
     SegmentChecker,
     arm_context,
 )
@@ -50,6 +51,7 @@ from drake_clutter.planning.trajectory_optimization import (
 )
 from drake_clutter.planning.transfer_planner import TransferPlanner
 from drake_clutter.robots.robot_model import load_robot
+from drake_clutter.scenes.interfaces import MovePart
 from drake_clutter.scenes.scene import Pose, SceneObject
 
 Floats = NDArray[np.float64]
@@ -145,7 +147,10 @@ class SegmentPlanner:
         lift = tool.extend_upwards(carry_path.reversed_approach, insertion)
         lowering = tool.extend_upwards(carry_path.retreat, insertion)
         if lift is None or lowering is None:
-            self._failures.record(3, PlanningFailureReason.UNREACHABLE, "above the object")
+            part = MovePart.PICK if lift is None else MovePart.PLACE
+            self._failures.record(
+                3, PlanningFailureReason.UNREACHABLE, "above the object", part=part
+            )
             return None
         # Candidate waypoints and payload of each segment, in the order of planning.
         candidates: dict[str, tuple[Iterable[Floats], Payload]] = {
@@ -228,6 +233,7 @@ class SegmentPlanner:
                 PlanningFailureReason.TRAJECTORY_INFEASIBLE,
                 f"{name}: {trajectory}",
                 trajectory.ratio,
+                PART_OF_SEGMENT[name],
             )
             return None
         return TrajectorySegment(
@@ -343,7 +349,10 @@ class SegmentPlanner:
             step = self._tools[candidate.tool].track(X_TG, path[-1])
             if step is None:
                 break
-            if self._checker.min_distance_along(step[1:], context, 0, "the descent") is None:
+            distance = self._checker.min_distance_along(
+                step[1:], context, 0, "the descent", MovePart.PLACE
+            )
+            if distance is None:
                 break
             path.append(step[1])
         if len(path) == 1:

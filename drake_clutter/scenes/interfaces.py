@@ -202,6 +202,20 @@ class PickPlaceCommand:
         return is_pose and not support.contains(*self.X_TO_place.translation[:2])
 
 
+class MovePart(Enum):
+    """Part of a move for which no plan was found.
+
+    Attributes:
+        PICK: The object cannot be picked, wherever it is to be placed.
+        CARRY: The object cannot be carried from where it is to the place.
+        PLACE: The object cannot be released at the place.
+    """
+
+    PICK = "pick"
+    CARRY = "carry"
+    PLACE = "place"
+
+
 class MoveResult(Enum):
     """How a move ended.
 
@@ -282,6 +296,8 @@ class Outcome:
         X_TO_released: Pose at which the picked object was released.
         samples: Recorded motion of arm and scene; None without an arm.
         failure_reason: Value of the `PlanningFailureReason` if no plan was found; else "".
+        failed_part: Part of the move for which no plan was found; None with a plan, or if no single
+            part is the cause.
     """
 
     result: MoveResult
@@ -293,6 +309,7 @@ class Outcome:
     X_TO_released: Pose | None = None
     samples: ActionSamples | None = field(repr=False, default=None)
     failure_reason: str = ""
+    failed_part: MovePart | None = None
 
     @property
     def instability_text(self) -> str:

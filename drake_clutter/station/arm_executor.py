@@ -88,12 +88,7 @@ class ArmExecutor:
         """Plan and simulate a command, see `MoveExecutor.execute`."""
         plan = self.plan(scene, command)
         if isinstance(plan, PlanningFailure):
-            return Outcome(
-                MoveResult.NOT_PLANNED,
-                scene,
-                detail=plan.description,
-                failure_reason=plan.reason.value,
-            )
+            return plan.outcome(scene)
         result = simulate_plan(
             self._config.cell,
             scene,

@@ -15,16 +15,12 @@ from drake_clutter.catalog import ObjectClass
 from drake_clutter.config import ClutterConfig, ExplorationConfig
 from drake_clutter.perception.label_detector import LabelDetector
 from drake_clutter.planning.carry_clearance import CarryClearance
-from drake_clutter.planning.pick_place_plan import (
-    PickPlacePlan,
-    PlanningFailure,
-    PlanningFailureReason,
-)
+from drake_clutter.planning.pick_place_plan import PickPlacePlan, PlanningFailure
 from drake_clutter.planning.pick_place_planner import PickPlacePlanner
 from drake_clutter.planning.planner_config import ANY_OVERLAP, PlannerConfig
 from drake_clutter.scenes.action_samples import ActionSamples
 from drake_clutter.scenes.geometry import transport_pose
-from drake_clutter.scenes.interfaces import MoveResult, Outcome
+from drake_clutter.scenes.interfaces import Outcome
 from drake_clutter.scenes.scene import Scene, SceneObject
 from drake_clutter.station.arm_executor import evaluate_no_grasp, evaluate_outcome
 from drake_clutter.station.body_sleep import nearest_object
@@ -285,11 +281,7 @@ class ClosedLoop:
             known = state.request.objects
             decision = to_ground_truth_names(decision, known, observation, before.objects)
         if isinstance(plan, PlanningFailure) and not state.request.tried:
-            is_full = plan.reason is PlanningFailureReason.NO_FREE_PLACEMENT
-            result = MoveResult.NO_FREE_PLACEMENT if is_full else MoveResult.NOT_PLANNED
-            outcome = Outcome(result, before, detail="" if is_full else str(plan))
-            outcome = replace(outcome, failure_reason=plan.reason.value)
-            return MoveAttempt(decision, outcome, self.perception)
+            return MoveAttempt(decision, plan.outcome(before), self.perception)
         assert decision.move is not None
         if isinstance(plan, PlanningFailure) or self.simulation.executor_state.missed_grasp:
             picked = decision.move.pick

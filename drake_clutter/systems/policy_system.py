@@ -12,7 +12,7 @@ from drake_clutter.belief.class_belief import Touch, touch_likelihoods
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.config import ExplorationConfig
 from drake_clutter.planning.pick_place_plan import PickPlacePlan
-from drake_clutter.scenes.interfaces import MoveResult, Observation
+from drake_clutter.scenes.interfaces import MovePart, MoveResult, Observation
 from drake_clutter.scenes.placement import resolve_placement
 from drake_clutter.seeding import item_rng
 from drake_clutter.station.messages import (
@@ -175,7 +175,9 @@ class PolicySystem(LeafSystem):
         if not isinstance(response.plan, PickPlacePlan):
             has_tried = bool(now.request.tried)
             result = MoveResult.NOT_GRASPED if has_tried else MoveResult.NOT_PLANNED
-            belief = self._record(context, now, result)
+            assert response.plan is not None
+            failed_part = response.plan.failed_part
+            belief = self._record(context, now, result, failed_part=failed_part)
             return replace(now, phase=PolicyPhase.OBSERVING, observation_time=time, belief=belief)
         finished, lowered_distance = self._finished.Eval(context)
         if finished != now.request.number:
@@ -199,6 +201,7 @@ class PolicySystem(LeafSystem):
         now: PolicyState,
         result: MoveResult,
         lowered_distance: float = 0.0,
+        failed_part: MovePart | None = None,
     ) -> Belief:
         """Return the belief after the requested move, with what the gripper felt.
 
@@ -207,6 +210,7 @@ class PolicySystem(LeafSystem):
             now: State with the request.
             result: Result of the move.
             lowered_distance: By how much the object was released below its planned pose [m].
+            failed_part: Part of the move for which no plan was found, see `PlanningFailure`.
         """
         move = now.request.move
         assert move is not None
@@ -218,9 +222,9 @@ class PolicySystem(LeafSystem):
             touch = self._touch(context, now, plan, lowered_distance)
         picked = next(o for o in now.belief.objects if o.name == move.pick)
         likelihoods = None
-        if self._classes and touch != Touch() and result is not MoveResult.NOT_PLANNED:
+        if self._classes and touch.has_felt:
             likelihoods = touch_likelihoods(picked, touch, self._classes, self._config.belief.touch)
-        return now.belief.record(move, result, X_TO_place, likelihoods)
+        return now.belief.record(move, result, X_TO_place, likelihoods, failed_part)
 
     def _touch(
         self, context: Context, now: PolicyState, plan: PickPlacePlan, lowered_distance: float

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from drake_clutter.belief.class_belief import pose_with_same_top, revise_class
 from drake_clutter.belief.hidden_belief import HiddenBelief
 from drake_clutter.catalog import ObjectClass
-from drake_clutter.scenes.interfaces import Detection, Move, MoveResult, Observation
+from drake_clutter.scenes.interfaces import Detection, Move, MovePart, MoveResult, Observation
 from drake_clutter.scenes.scene import TRAY, Pose, SceneObject
 
 UNMOVED_TOLERANCE = 0.01
@@ -26,6 +26,12 @@ A pose estimate is more accurate than this, and a placement moves an object fart
 
 MAX_TOP_DISTANCE = 0.03
 """Largest distance of the tops of a detection and of the known object that it may be [m]."""
+
+MAX_FAILED_CARRIES = 2
+"""Number of places to which no way was found, after which other objects are picked first.
+
+One other place is tried: from the same pick, most ways start alike.
+"""
 
 
 def legal_moves(observation: Observation) -> list[Move]:
@@ -58,6 +64,21 @@ class Decision:
 
 
 @dataclass(frozen=True)
+class FailedMove:
+    """A move that failed, and what failed in it.
+
+    Attributes:
+        picked: The object as it was believed.
+        result: Result of the move.
+        part: Part of the move that failed; None if no single part is the cause.
+    """
+
+    picked: SceneObject
+    result: MoveResult
+    part: MovePart | None
+
+
+@dataclass(frozen=True)
 class Belief:
     """State of an explorer's knowledge during an episode.
 
@@ -68,8 +89,9 @@ class Belief:
         invalid_moves: Moves that could not be carried out since the belief last changed.
         previous_pose: Pose X_TO of the object of the latest move before it was placed, until the
             next observation shows whether it has moved; otherwise None.
-        ungrasped: Objects as they were believed when the gripper did not grasp them. None of them
-            is picked again as long as it is believed to be the same.
+        failures: Moves that failed. An object that the gripper did not grasp is not picked again as
+            long as it is believed to be the same. A failure of planning counts until an object has
+            moved, see `deferred_moves`.
         touch: Likelihood of what the gripper felt in all moves of an object, by its name and class.
     """
 
@@ -77,7 +99,7 @@ class Belief:
     history: tuple[Move, ...] = ()
     invalid_moves: tuple[Move, ...] = ()
     previous_pose: Pose | None = None
-    ungrasped: tuple[SceneObject, ...] = ()
+    failures: tuple[FailedMove, ...] = ()
     touch: Mapping[str, Mapping[ObjectClass, float]] = field(default_factory=dict)
 
     def update(self, observation: Observation) -> "Belief":
@@ -88,10 +110,9 @@ class Belief:
         those of an object that the gripper did not grasp, as long as it is believed to be the same.
         """
         updated = self._with_detections(observation)
-        ungrasped = {
-            d.name for d in observation.detections if any(_is_same(d, o) for o in self.ungrasped)
-        }
-        moves = [move for move in legal_moves(observation) if move.pick in ungrasped]
+        ungrasped = [f for f in self.failures if f.result is MoveResult.NOT_GRASPED]
+        names = {d.name for d in observation.detections if _failures_of(d, ungrasped)}
+        moves = [move for move in legal_moves(observation) if move.pick in names]
         known_moves = set(updated.invalid_moves)
         added = tuple(move for move in moves if move not in known_moves)
         return replace(updated, invalid_moves=(*updated.invalid_moves, *added))
@@ -114,7 +135,7 @@ class Belief:
         if picked is None or np.linalg.norm(self.previous_pose.p - picked.X_TO.p) > (
             UNMOVED_TOLERANCE
         ):
-            return replace(updated, invalid_moves=())
+            return replace(updated, invalid_moves=(), failures=self._lasting_failures())
         moves_of_picked = [move for move in legal_moves(observation) if move.pick == picked.name]
         invalid_moves = (*self.invalid_moves, *moves_of_picked) if moves_of_picked else ()
         return replace(updated, invalid_moves=invalid_moves)
@@ -125,6 +146,7 @@ class Belief:
         result: MoveResult,
         X_TO_place: Pose | None = None,
         touch: Mapping[ObjectClass, float] | None = None,
+        failed_part: MovePart | None = None,
     ) -> "Belief":
         """Return the belief after a move.
 
@@ -133,25 +155,50 @@ class Belief:
             result: Its result, as far as the explorer can observe it.
             X_TO_place: Pose at which the object was released, if it was placed.
             touch: Likelihood of what the gripper felt, by class; None if it felt nothing.
+            failed_part: Part of the move for which no plan was found; None if there was a plan, or
+                if no single part is the cause.
         """
         if touch is not None:
             earlier = self.touch.get(move.pick, {})
             product = {c: value * earlier.get(c, 1.0) for c, value in touch.items()}
             felt = replace(self, touch={**self.touch, move.pick: product})
-            return felt.record(move, result, X_TO_place)
+            return felt.record(move, result, X_TO_place, failed_part=failed_part)
         history = (*self.history, move)
-        if result is MoveResult.NOT_GRASPED:
-            ungrasped = tuple(o for o in self.objects if o.name == move.pick)
-            return replace(self, history=history, ungrasped=(*self.ungrasped, *ungrasped))
-        if not result.was_executed:
-            return replace(self, history=history, invalid_moves=(*self.invalid_moves, move))
+        if result is MoveResult.NOT_GRASPED or not result.was_executed:
+            is_ungrasped = result is MoveResult.NOT_GRASPED
+            part = MovePart.PICK if is_ungrasped else failed_part
+            picked = [o for o in self.objects if o.name == move.pick]
+            failures = (*self.failures, *(FailedMove(o, result, part) for o in picked))
+            invalid_moves = self.invalid_moves if is_ungrasped else (*self.invalid_moves, move)
+            return replace(self, history=history, invalid_moves=invalid_moves, failures=failures)
         if not result.is_at_placement or X_TO_place is None:
-            return replace(self, history=history, invalid_moves=())
+            failures = self._lasting_failures()
+            return replace(self, history=history, invalid_moves=(), failures=failures)
         previous_pose = next(o.X_TO for o in self.objects if o.name == move.pick)
         objects = tuple(
             replace(o, X_TO=X_TO_place) if o.name == move.pick else o for o in self.objects
         )
         return replace(self, objects=objects, history=history, previous_pose=previous_pose)
+
+    def _lasting_failures(self) -> tuple[FailedMove, ...]:
+        """Return the failures that count although an object has moved."""
+        return tuple(f for f in self.failures if f.result is MoveResult.NOT_GRASPED)
+
+    def deferred_moves(self, observation: Observation) -> list[Move]:
+        """Return the moves of objects for which another place is not expected to help.
+
+        These are objects that could not be picked, or for which no way was found to
+        `MAX_FAILED_CARRIES` places, as long as they are believed to be the same.
+
+        Args:
+            observation: Latest observation, with the names of the belief.
+        """
+        names = set[str]()
+        for d in observation.detections:
+            parts = [f.part for f in _failures_of(d, self.failures)]
+            if MovePart.PICK in parts or parts.count(MovePart.CARRY) >= MAX_FAILED_CARRIES:
+                names.add(d.name)
+        return [move for move in legal_moves(observation) if move.pick in names]
 
     def remove(self, names: Collection[str]) -> "Belief":
         """Return the belief without some objects, which may be detected again as new objects.
@@ -209,6 +256,11 @@ def _is_same(detection: Detection, o: SceneObject) -> bool:
     distance = float(np.linalg.norm(detection.X_TO.p - o.X_TO.p))
     is_same_class = detection.object_class.name == o.object_class.name
     return is_same_class and distance < UNMOVED_TOLERANCE
+
+
+def _failures_of(detection: Detection, failures: Sequence[FailedMove]) -> list[FailedMove]:
+    """Return the failures of a detected object that is believed to be the same since then."""
+    return [failure for failure in failures if _is_same(detection, failure.picked)]
 
 
 class Policy(Protocol):
@@ -282,6 +334,8 @@ def select_move(
 ) -> Decision:
     """Return a policy's decision.
 
+    Moves that are deferred are left to the policy only if it has no other one.
+
     Args:
         policy: The policy.
         belief: The belief after the observation.
@@ -292,4 +346,10 @@ def select_move(
     if action_filter is not None:
         infeasible = action_filter(belief, observation)
         belief = replace(belief, invalid_moves=(*belief.invalid_moves, *infeasible))
+    deferred = belief.deferred_moves(observation)
+    if deferred:
+        others = replace(belief, invalid_moves=(*belief.invalid_moves, *deferred))
+        decision = policy(others, observation, rng)
+        if decision.move is not None or decision.is_stop:
+            return decision
     return policy(belief, observation, rng)

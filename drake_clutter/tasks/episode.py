@@ -15,6 +15,7 @@ from drake_clutter.perception.ray_detector import RayDetector
 from drake_clutter.scenes.interfaces import (
     Move,
     MoveExecutor,
+    MovePart,
     MoveResult,
     Observation,
     Outcome,
@@ -226,12 +227,14 @@ class SteppedBackend:
         rng = self.outcome_rng
         command = resolve_placement(move, self.observation, self.config, rng)
         if command is None:
-            outcome = Outcome(MoveResult.NO_FREE_PLACEMENT, self.scene)
+            outcome = Outcome(MoveResult.NO_FREE_PLACEMENT, self.scene, failed_part=MovePart.PLACE)
             self.belief = self.belief.record(move, outcome.result)
         else:
             outcome = self.execute(command, rng)
             result = self.observable_result(outcome)
-            self.belief = self.belief.record(move, result, command.X_TO_place)
+            self.belief = self.belief.record(
+                move, result, command.X_TO_place, failed_part=outcome.failed_part
+            )
         return outcome
 
     def rollout(self, policy: Policy) -> Generator[MoveAttempt, None, Decision]:
