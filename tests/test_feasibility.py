@@ -393,7 +393,7 @@ def test_a_summary_is_of_the_possible_moves() -> None:
     assert -1 <= low < 0 < high <= 1
     first, second, third = answer_sentences(summary)
     assert first.startswith("a does 2 of the 3 moves that 2 scenes and its tools allow: 66.7 %")
-    assert second == "Of its 1 failure, 1 are \u201cunreachable\u201d."
+    assert second == "Of its 1 failure, 1 is \u201cunreachable\u201d."
     assert third.endswith(
         f"b is next, 33.3 points behind (95 % interval {100 * low:.1f} to {100 * high:.1f}): the "
         "data are compatible with no difference."

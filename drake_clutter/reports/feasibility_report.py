@@ -127,7 +127,9 @@ def answer_sentences(summary: Row) -> list[str]:
     if failures:
         reason, count = failures.most_common(1)[0]
         failed = best["possible"] - best["planned"]
-        sentences.append(f"Of its {_number(failed, 'failure')}, {count} are \u201c{reason}\u201d.")
+        verb = "is" if count == 1 else "are"
+        failures_text = _number(failed, "failure")
+        sentences.append(f"Of its {failures_text}, {count} {verb} \u201c{reason}\u201d.")
     else:
         sentences.append("No possible move fails.")
     cycle = best["cycle_s"]["median"]
