@@ -36,7 +36,6 @@ IMPOSSIBLE_RESULTS = frozenset(
     for reason in (
         PlanningFailureReason.NO_FREE_PLACEMENT,
         PlanningFailureReason.CARRIES_OTHERS,
-        PlanningFailureReason.OBJECTS_OVERLAP,
         PlanningFailureReason.NO_SEAL,
         PlanningFailureReason.NO_OPPOSED_FACES,
         PlanningFailureReason.PLACE_IN_COLLISION,
@@ -45,8 +44,7 @@ IMPOSSIBLE_RESULTS = frozenset(
         PlanningFailureReason.PLACE_OFF_BALANCE,
     )
 )
-"""Results that no arm changes: no room, objects on top or in each other, or no tool that holds the
-object."""
+"""Results that no arm changes: no room, objects on top, or no tool that holds the object."""
 MAX_OPTIMIZED_MOVES = 5
 """Number of moves of a scene whose motions are optimized, for their cycle times."""
 BELOW_TOLERANCE = 0.004

@@ -130,8 +130,6 @@ class MoveFinder:
                 return verified
             candidates = [verified]
         model = self.collision_model(state.objects, occluded)
-        if failure := check_overlaps(model, state.objects, self.config.max_overlap):
-            return failure
         failure = self._check_endpoints(state, goal, model)
         if failure is not None:
             return failure
@@ -179,9 +177,6 @@ class MoveFinder:
         held = state.held
         assert held is not None
         model = self.collision_model(state.objects, occluded)
-        others = [o for o in state.objects if o.name != held.name]
-        if failure := check_overlaps(model, others, self.config.max_overlap):
-            return failure
         if failure := self._check_endpoints(state, goal, model):
             return failure
         X_TG = RigidTransform(self.tools[held.tool].pose(np.array(state.q)))
@@ -261,6 +256,9 @@ class MoveFinder:
             return failure
         if self.cell.pedestal_overlaps_support:
             return PlanningFailure(PlanningFailureReason.IN_COLLISION, "pedestal and tray")
+        at_rest = [o for o in state.objects if state.held is None or o.name != state.held.name]
+        if failure := check_overlaps(model, at_rest, self.config.max_overlap):
+            return failure
         if state.held is None:
             if failure := check_configuration(
                 self.robot, self.config.min_distance, model, np.array(state.q), "at the start"
