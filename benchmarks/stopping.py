@@ -11,7 +11,6 @@ file; an interrupted run is resumed by the same command.
 Scenes 160 to 259 of sg_star_25 are left out.
 """
 
-from dataclasses import dataclass
 from functools import partial
 from typing import Annotated
 
@@ -75,17 +74,6 @@ class StoppingRecord(BaseModel):
     commit: str
 
 
-@dataclass(frozen=True)
-class StoppingEpisode:
-    """An episode to be run.
-
-    Attributes:
-        index: Index of the scene, from which the random generator is seeded.
-    """
-
-    index: int
-
-
 def load_scene(scenes: SceneDataset, index: int, config: ClutterConfig, seed: int) -> Scene:
     """Return a scene of a dataset, laid out anew if the dataset has no poses."""
     if scenes.scenes[index].settled_poses is not None:
@@ -119,14 +107,18 @@ class StoppingRunner:
         self._make_policy: PolicyFactory = make_policy_factory(agent, self._config)
         self._make_backend = make_backend_factory(fidelity, self._config)
 
-    def __call__(self, episode: StoppingEpisode) -> Row:
-        """Return the record of an episode, without its commit."""
+    def __call__(self, index: int) -> Row:
+        """Return the record of an episode, without its commit.
+
+        Args:
+            index: Index of the scene, from which the random generator is seeded.
+        """
         config = self._config
-        scene = load_scene(self._scenes, episode.index, config, self._seed)
+        scene = load_scene(self._scenes, index, config, self._seed)
         if self._perception == PERFECT:
-            backend = self._make_backend(scene, item_rng(self._seed, episode.index))
+            backend = self._make_backend(scene, item_rng(self._seed, index))
         else:
-            seed = int(item_rng(self._seed, episode.index).integers(2**31))
+            seed = int(item_rng(self._seed, index).integers(2**31))
             objects = self._scenes.metadata["objects"]
             scenario = Scenario(objects=objects, perception=self._perception, seed=seed)
             perceive = make_perception(scenario, scene)
@@ -231,7 +223,7 @@ def episodes(
         | {"sha256": scenes.sha256, "seed": seed, "moves": max_moves, "first": first}
         | {"config": to_plain(ClutterConfig())},
         partial(StoppingRunner, name, agent, fidelity, perception, seed, max_moves),
-        [StoppingEpisode(index) for index in range(first, last)],
+        range(first, last),
         schema=StoppingRecord,
         workers=workers,
     )

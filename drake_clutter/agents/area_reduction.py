@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 
 from drake_clutter.catalog import ObjectClass
 from drake_clutter.cell.lip_seal import piece_half_spaces
-from drake_clutter.cell.pinhole import MIN_DEPTH, point_to_camera, project
 from drake_clutter.compilation import njit
 from drake_clutter.config import ExplorationConfig
 from drake_clutter.grammar import Orientation, resting_rotation
-from drake_clutter.scenes.free_space import CELL_SIZE, DEPTH_TOLERANCE, Grid
+from drake_clutter.scenes.free_space import CELL_SIZE, Grid, occluding_pixel
 from drake_clutter.scenes.interfaces import Move, Observation
 from drake_clutter.scenes.placement import find_free_placements, has_clear_top
 from drake_clutter.scenes.release_orientation import OrientedObject, orient_object
@@ -54,22 +53,11 @@ def _find_occluders(depth, label, camera, x, y, z, occluder):  # type: ignore[no
         z: Centers along z [m]. Shape (l,).
         occluder: Output: index of the detection, `_UNIDENTIFIED` or `_VISIBLE`. Shape (l, n, m).
     """
-    height, width = depth.shape
     for k in range(len(z)):
         for i in range(len(x)):
             for j in range(len(y)):
-                occluder[k, i, j] = _VISIBLE
-                p_x, p_y, distance = point_to_camera(camera, x[i], y[j], z[k])
-                if distance <= MIN_DEPTH:
-                    continue
-                u, v = project(camera, p_x, p_y, distance)
-                column, row = int(np.rint(u)), int(np.rint(v))
-                if (
-                    0 <= row < height
-                    and 0 <= column < width
-                    and depth[row, column] < distance - DEPTH_TOLERANCE
-                ):
-                    occluder[k, i, j] = label[row, column]
+                row, column = occluding_pixel(depth, camera, x[i], y[j], z[k])
+                occluder[k, i, j] = _VISIBLE if row < 0 else label[row, column]
 
 
 @njit(cache=True)

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from drake_clutter.belief.known_supports import REST_ORIENTATIONS, resting_heights
 from drake_clutter.catalog import ObjectClass, Shape
-from drake_clutter.cell.pinhole import MIN_DEPTH, point_to_camera, project
 from drake_clutter.compilation import njit
 from drake_clutter.grammar.orientation import resting_rotation
-from drake_clutter.scenes.free_space import CELL_SIZE, DEPTH_TOLERANCE, Grid
+from drake_clutter.scenes.free_space import CELL_SIZE, Grid, occluding_pixel
 from drake_clutter.scenes.interfaces import Observation
 from drake_clutter.scenes.release_orientation import orient_object, yaw_steps
 from drake_clutter.scenes.scene import Pose, SceneObject
@@ -68,19 +67,12 @@ def _hidden_columns(depth, camera, x, y, top, bodies, heights, is_covered):  # t
         is_covered: Output. Shape (n, m).
     """
     centers, rotations, halves, cylinders = bodies
-    num_rows, num_columns = depth.shape
     for i in range(len(x)):
         for j in range(len(y)):
             z = _HEIGHT_STEP / 2
             while z < top:
-                p_x, p_y, p_z = point_to_camera(camera, x[i], y[j], z)
-                if p_z <= MIN_DEPTH:
-                    break
-                u, v = project(camera, p_x, p_y, p_z)
-                column, row = int(np.rint(u)), int(np.rint(v))
-                if not (0 <= row < num_rows and 0 <= column < num_columns):
-                    break
-                if not depth[row, column] < p_z - DEPTH_TOLERANCE:
+                row, _ = occluding_pixel(depth, camera, x[i], y[j], z)
+                if row < 0:
                     break
                 if _known_at(x[i], y[j], z, centers, rotations, halves, cylinders):
                     break

@@ -165,6 +165,33 @@ def make_footprint(sides: NDArray[np.float64], clearance: float) -> Footprint:
 
 
 @njit(cache=True)
+def occluding_pixel(depth, camera, x, y, z):  # type: ignore[no-untyped-def]
+    """Return the row and column of the pixel whose surface hides a point from the camera.
+
+    Args:
+        depth: Depth image [m]. Shape (height, width).
+        camera: `Pinhole` of the camera.
+        x: Position of the point in T [m].
+        y: Position of the point in T [m].
+        z: Position of the point in T [m].
+
+    Returns:
+        Row and column; -1 and -1 if the point is in view or out of the image.
+    """
+    p_x, p_y, point_depth = point_to_camera(camera, x, y, z)
+    if point_depth <= MIN_DEPTH:
+        return -1, -1
+    u, v = project(camera, p_x, p_y, point_depth)
+    column, row = int(np.rint(u)), int(np.rint(v))
+    height, width = depth.shape
+    if not (0 <= row < height and 0 <= column < width):
+        return -1, -1
+    if depth[row, column] < point_depth - DEPTH_TOLERANCE:
+        return row, column
+    return -1, -1
+
+
+@njit(cache=True)
 def _is_free(depth, camera, x, y, levels):  # type: ignore[no-untyped-def]
     """Return whether the camera sees through points at several heights above a cell."""
     height, width = depth.shape
