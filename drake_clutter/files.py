@@ -10,6 +10,7 @@ import secrets
 import stat
 import sys
 import tempfile
+import traceback
 from collections.abc import Iterator
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
@@ -235,30 +236,38 @@ def cli_error_handler() -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        print(f"error {error}", file=sys.stderr)
+        _print_last_line(f"error {error}", error)
         sys.exit(2)
     except OSError as error:
         if error.errno not in _STORAGE_ERRORS:
             raise
         place = error.filename2 or error.filename or "a file"  # the second one is a target
         problem = f"cannot be written or read ({os.strerror(error.errno)})"
-        print(f"error {place}: {problem}; finished results are kept", file=sys.stderr)
+        _print_last_line(f"error {place}: {problem}; finished results are kept", error)
         sys.exit(2)
     except BrokenProcessPool as error:
-        print(f"error {_single_line(str(error))}; finished results are kept", file=sys.stderr)
+        _print_last_line(f"error {_single_line(str(error))}; finished results are kept", error)
         sys.exit(2)
-    except KeyboardInterrupt:
-        _print_interruption()
+    except KeyboardInterrupt as error:
+        _print_last_line(INTERRUPTION, error)
         sys.exit(_INTERRUPTED)
     except SystemExit as error:
         # Typer turns a KeyboardInterrupt into this exit code.
         if error.code == _INTERRUPTED:
-            _print_interruption()
+            _print_last_line(INTERRUPTION, error)
         raise
 
 
-def _print_interruption() -> None:
-    print(INTERRUPTION, file=sys.stderr)
+def _print_last_line(line: str, error: BaseException) -> None:
+    """Print the last line of a program that an error ends, after what else is to be printed.
+
+    The frames of the error hold progress bars, which print a last line when they are closed.
+    """
+    cause: BaseException | None = error
+    while cause is not None:
+        traceback.clear_frames(cause.__traceback__)
+        cause = cause.__context__
+    print(line, file=sys.stderr)
 
 
 def temporary_path(path: Path) -> Path:

@@ -6,9 +6,12 @@ from pathlib import Path
 
 import pytest
 
+from drake_clutter.cli.output import progress_bar
 from drake_clutter.files import (
+    INTERRUPTION,
     InputError,
     atomic_write,
+    cli_error_handler,
     read_text,
     write_json,
     write_text,
@@ -111,3 +114,18 @@ def test_deep_and_exponential_yaml_is_refused(text: str, problem: str) -> None:
 def test_nested_yaml_with_anchors_is_read() -> None:
     nested = "[" * 99 + "]" * 99
     assert str(parse_yaml(f"{{a: &x [1, 2], b: *x, c: {nested[1:-1]}}}", "f")["b"]) == "[1, 2]"
+
+
+def test_an_interruption_is_the_last_line_after_that_of_a_progress_bar(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def work() -> None:
+        items = progress_bar("items", [1, 2], 0, 2)
+        next(items)
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit), cli_error_handler():
+        work()
+    *_, bar, last = capsys.readouterr().err.splitlines()
+    assert bar.startswith("items")
+    assert last == INTERRUPTION

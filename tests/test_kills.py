@@ -180,10 +180,12 @@ def read_tree(out: Path) -> Tree:
             table = parquet.read_table(path)
             rows = [row | {"planning_s": ""} for row in table.to_pylist()]
             tree[str(path.relative_to(out))] = json.dumps(rows)
-        elif path.is_file() and path.suffix == ".rrd":  # Its rows have random identifiers.
+        elif path.is_file() and path.suffix == ".rrd":
+            # Its rows have random identifiers, and one has the time of the recording.
+            ignored = re.compile("RowId|start_time")
             entities = {
                 entity: [
-                    (time, {name: value for name, value in row.items() if "RowId" not in name})
+                    (time, {name: value for name, value in row.items() if not ignored.search(name)})
                     for time, row in rows
                 ]
                 for entity, rows in read_rerun(path).items()
