@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
@@ -43,6 +44,19 @@ VERSION_1 = Path(__file__).parent / "data" / "trajectory_v1.h5"
 STARTS = (1.0, 4.0, 5.0)
 """Times of the actions: of 2 s, of none, of 2 s, with pauses of 1 s."""
 Rows = dict[str, NDArray[np.float64]]
+FOXGLOVE_FIELDS = {
+    "foxglove.FrameTransforms": {"transforms"},
+    "foxglove.SceneUpdate": {"deletions", "entities"},
+    "foxglove.JointStates": {"timestamp", "joints"},
+    "foxglove.Log": {"timestamp", "level", "message", "name", "file", "line"},
+    "foxglove.CompressedImage": {"timestamp", "frame_id", "data", "format"},
+    "foxglove.RawImage": {"timestamp", "frame_id", "width", "height", "encoding", "step", "data"},
+    "foxglove.CameraCalibration": {
+        *("timestamp", "frame_id", "width", "height"),
+        *("distortion_model", "D", "K", "R", "P"),
+    },
+}
+"""Fields of each schema, see https://docs.foxglove.dev/docs/sdk/schemas."""
 
 
 @pytest.fixture(scope="module")
@@ -77,15 +91,19 @@ def rrd(
 
 
 @pytest.fixture(scope="module")
-def mcap(
-    episode: RecordedEpisode, tmp_path_factory: pytest.TempPathFactory
-) -> dict[str, list[tuple[float, Any]]]:
-    """Messages of each topic with their times [s], in order of time."""
+def mcap_file(episode: RecordedEpisode, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """MCAP file of the episode."""
     path = tmp_path_factory.mktemp("mcap") / "episode.mcap"
     write_mcap(path, episode)
     assert [entry.name for entry in path.parent.iterdir()] == ["episode.mcap"]
+    return path
+
+
+@pytest.fixture(scope="module")
+def mcap(mcap_file: Path) -> dict[str, list[tuple[float, Any]]]:
+    """Messages of each topic with their times [s], in order of time."""
     messages = defaultdict(list)
-    with path.open("rb") as file:
+    with mcap_file.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         for schema, channel, message in reader.iter_messages():
             assert schema is not None
@@ -166,6 +184,69 @@ def test_rerun_holds_signals_belief_plan_images_and_events(
     texts = [row["TextLog:text"][0] for _, row in rrd["/events"]]
     assert sorted(texts) == sorted(event.text for event in events(episode))
     assert "/objects/gelatin_box/part_0" in rrd, "the mesh"
+
+
+def test_mcap_schemas_are_those_that_foxglove_documents(mcap_file: Path) -> None:
+    """Foxglove recognizes a schema by its name; the fields are those of its reference."""
+    with mcap_file.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    found = dict[str, str]()
+    for channel in summary.channels.values():
+        schema = summary.schemas[channel.schema_id]
+        found[channel.topic] = schema.name
+        if channel.topic == "/gripper":
+            assert (channel.message_encoding, schema.encoding) == ("json", "jsonschema")
+            assert json.loads(schema.data)["title"] == schema.name
+            continue
+        assert channel.message_encoding == schema.encoding == "protobuf"
+        files = FileDescriptorSet.FromString(schema.data).file
+        # The descriptors are complete: a reader needs no other file.
+        assert {name for f in files for name in f.dependency} <= {f.name for f in files}
+        messages = {f"{f.package}.{m.name}": m for f in files for m in f.message_type}
+        fields = {field.name for field in messages[schema.name].field}
+        assert fields == FOXGLOVE_FIELDS[schema.name]
+    camera = "/cameras/overhead"
+    assert found == {
+        "/tf": "foxglove.FrameTransforms",
+        **dict.fromkeys(("/scene", "/belief", "/plan"), "foxglove.SceneUpdate"),
+        **dict.fromkeys(("/joint_states", "/joint_commands"), "foxglove.JointStates"),
+        "/gripper": "drake_clutter.Gripper",
+        "/events": "foxglove.Log",
+        f"{camera}/color": "foxglove.CompressedImage",
+        f"{camera}/depth": "foxglove.RawImage",
+        f"{camera}/segmentation": "foxglove.RawImage",
+        f"{camera}/calibration": "foxglove.CameraCalibration",
+    }
+
+
+def test_mcap_messages_can_be_shown(mcap: dict[str, Any]) -> None:
+    """Frames are known, images have the size of the calibration, and stamps are the log times."""
+    frames = {"T"}
+    for time, message in mcap["/tf"]:
+        for transform in message.transforms:
+            frames.add(transform.child_frame_id)
+            assert transform.timestamp.ToNanoseconds() == round(1e9 * time)
+            q = transform.rotation
+            assert q.w**2 + q.x**2 + q.y**2 + q.z**2 == pytest.approx(1.0)
+    for topic in ("/scene", "/belief", "/plan"):
+        for _, update in mcap[topic]:
+            assert {entity.frame_id for entity in update.entities} <= frames
+    camera = "/cameras/overhead"
+    for (time, color), (_, depth), (_, labels), (_, calibration) in zip(
+        *(mcap[f"{camera}/{kind}"] for kind in ("color", "depth", "segmentation", "calibration")),
+        strict=True,
+    ):
+        messages = (color, depth, labels, calibration)
+        assert {message.frame_id for message in messages} == {"cameras/overhead"} <= frames
+        assert {m.timestamp.ToNanoseconds() for m in messages} == {round(1e9 * time)}
+        size = calibration.width, calibration.height
+        image = Image.open(io.BytesIO(color.data))
+        assert (color.format, image.format, image.size) == ("jpeg", "JPEG", size)
+        for raw, encoding, pixel in ((depth, "16UC1", 2), (labels, "mono8", 1)):
+            assert (raw.encoding, raw.width, raw.height) == (encoding, *size)
+            assert (raw.step, len(raw.data)) == (pixel * size[0], pixel * size[0] * size[1])
+        assert [len(calibration.K), len(calibration.R), len(calibration.P)] == [9, 9, 12]
 
 
 def test_mcap_holds_frames_joints_gripper_and_events(
