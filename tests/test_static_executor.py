@@ -19,6 +19,7 @@ from drake_clutter.scenes.interfaces import (
     InstabilityReason,
     Move,
     MoveExecutor,
+    MovePart,
     MoveResult,
     Observation,
     Outcome,
@@ -340,7 +341,8 @@ def test_no_free_spot_is_no_question_for_an_executor() -> None:
     scene = scene_of(leaning(resting("gelatin_box", name="box")), side=0.12)
     detector = RayDetector(CONFIG.cell.camera)
     backend = SteppedBackend(Unasked(), detector, CONFIG.exploration, scene, rng())
-    assert backend.step(Move("box")) == Outcome(MoveResult.NO_FREE_PLACEMENT, scene)
+    outcome = Outcome(MoveResult.NO_FREE_PLACEMENT, scene, failed_part=MovePart.PLACE)
+    assert backend.step(Move("box")) == outcome
     assert backend.belief.invalid_moves == backend.belief.history == (Move("box"),)
 
 

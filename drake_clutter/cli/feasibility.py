@@ -1,6 +1,5 @@
 """`drake-clutter feasibility`."""
 
-import gc
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
@@ -129,8 +128,6 @@ def feasibility(
     Writes tables, `summary.json` and the web page `report.html`. An interrupted study resumes
     when the same command is given again.
     """
-    # Garbage collection would examine all of these modules again and again, here and later on.
-    gc.disable()
     from drake_clutter.commands.feasibility_job import (
         FeasibilityJob,
         check_unique_names,
@@ -143,8 +140,6 @@ def feasibility(
     from drake_clutter.feasibility.setups import SetupRequest, parse_sweep, sweep_setups
     from drake_clutter.reports.terminal_text import describe_feasibility
 
-    gc.freeze()
-    gc.enable()
     reject_support_settings(settings)
     files = collect_scene_files(scenes)
     _, config = load_scene_and_config(files[0], catalog, config_file, None, settings)
