@@ -44,26 +44,26 @@ class CommandSchedule:
     gripper_targets: tuple[tuple[float, Floats], ...]
 
     def held_time(self, time: float) -> float:
-        """Return from when on the object is held whose grasp began last [s]: the end of its dwell.
+        """Return when the gripper holds an object: at the end of the last grasp's dwell [s].
 
-        Vacuum has to build up, and jaws have to close.
+        During the dwell vacuum builds up, or jaws close.
 
         Args:
             time: Time since the start of the plan [s].
 
         Returns:
-            The time [s]; infinite if no grasp has begun.
+            The time [s]; infinite before the first grasp.
         """
         tools = ("", *(step.tool for step in self.steps))
         ends = (*self.starts[1:], self.end_time)
-        begun = [
+        grasp_ends = [
             end
             for start, end, before, tool in zip(
                 self.starts, ends, tools[:-1], tools[1:], strict=True
             )
             if tool and not before and start <= time
         ]
-        return begun[-1] if begun else math.inf
+        return grasp_ends[-1] if grasp_ends else math.inf
 
     @property
     def release_time(self) -> float:
