@@ -210,7 +210,7 @@ def evaluate(
         rows.append(
             {
                 "observation": config.observation,
-                "config": to_plain(config),
+                "training": to_plain(config),
                 "seed": config.seed,
                 "moves": metadata["moves"],
                 "held_out": len(records),

@@ -167,7 +167,8 @@ def _limits() -> str:
         "Random moves of the UR10, UR3e, UR5e, UR10e, UR16e and iiwa 14, each planned without and "
         "with optimization. Ratios to the limits are those of the returned trajectories at 500 Hz, "
         "with Drake's dynamics. *Time-optimal*: TOPP-RA along the same path without a limit of "
-        "jerk, with steps of the acceleration also at rest.",
+        "jerk, with steps of the acceleration also at rest. The results file holds the "
+        "configuration of the planner.",
         command=f"python {results['command']} --out FILE",
         seed=results["seed"],
         results=[
@@ -319,15 +320,16 @@ def _speed() -> str:
         f"{results['count']} random moves in scenes of 25 nodes, simulated in turn by an earlier "
         "version whose bellows do not bend and by this one, whose bellows do, on one core; the "
         "results file names its commit. *Uneventful*: nothing fell, and no object is 5 mm from "
-        "where it should be. Differences of positions are the largest of "
-        "all objects, over moves that are uneventful in both.",
+        "where it should be. Ratios are those of single moves; eventful ones are simulated twice. "
+        "Differences of positions are the largest of all objects, over moves that "
+        "are uneventful in both.",
         command=f"python {results['command']} --baseline DIR --out FILE",
         seed=results["seed"],
         results=[f"benchmarks/results/{SPEED}"],
     )
     versions = (rows["before"], rows["after"])
     return text + table(
-        ["", "before", "after", "before / after"],
+        ["", "before", "after", "ratio before / after"],
         [
             [
                 "processor time, median / 95th [s]",
@@ -383,18 +385,18 @@ def _cups() -> str:
 
 def _cloning() -> str:
     results = read_training_results(CLONING)
-    config = results["rows"][0]["config"]
+    training = results["rows"][0]["training"]
     text = section(
         "Policies cloned from recorded moves",
         "Networks that reach for a given object from home, cloned from the recorded approaches of "
         "a data set ([how to train them](../how_to/train_networks.md#reaching-policy)), control "
         f"the arm in the station at {1 / results['control_period_s']:g} Hz. *State*: sees the "
         "position of the object. *Depth*: sees the overhead depth image and the mask of the "
-        f"object. They learn from moves of `{config['data']}` with the tool `{config['tool']}`. "
-        f"Held-out moves are of `{results['data']}` from episode {results['first_episode']} on, "
-        "whose scenes are not among those of training or validation. *Reached*: the policy ends "
-        "where the cup can attach to the object, which has not moved by more than "
-        f"{results['max_displacement_mm']:g} mm.",
+        f"object. They learn from moves of `{training['data']}` with the tool "
+        f"`{training['tool']}`. Held-out moves are of `{results['data']}` from episode "
+        f"{results['first_episode']} on, whose scenes are not among those of training or "
+        "validation. *Reached*: the policy ends where the cup can attach to the object, "
+        f"which has not moved by more than {results['max_displacement_mm']:g} mm.",
         command="python training/train_bc.py evaluate runs/bc_state runs/bc_depth "
         f"--data {results['data']} --first {results['first_episode']} --out FILE",
         seed=", ".join(str(seed) for seed in sorted({row["seed"] for row in results["rows"]})),

@@ -358,7 +358,7 @@ def page() -> str:
     """Return the page."""
     intro = (
         "# Scene generation\n\nScene generators compared by Drake. Intervals of means are "
-        "those of the [normal approximation](intervals.md).\n\n"
+        "those of the [normal approximation](intervals.md), except for MaskablePPO.\n\n"
     ) + table(
         ["name", "`--agent`", "generator"],
         [[name, f"`{agent}`", text] for name, agent, text in _NAMES],

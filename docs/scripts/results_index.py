@@ -32,7 +32,7 @@ PAGES = (
 
 
 def _row(rows: list[dict[str, Any]], **values: Any) -> dict[str, Any]:
-    return next(row for row in rows if all(row[key] == value for key, value in values.items()))
+    return next(row for row in rows if all(row.get(key) == value for key, value in values.items()))
 
 
 def _headlines() -> list[list[str]]:
@@ -48,6 +48,7 @@ def _headlines() -> list[list[str]]:
         scenes="sg_star_25",
         perception="depth",
         motion="arm",
+        cell="two_cups",
     )
     detector = read_training_results("detector_depth.json")["rows"]["sg_star_25"]
     judges = read_benchmark_results("judges.json")["scenes"][0]
@@ -73,8 +74,8 @@ def _headlines() -> list[list[str]]:
             "",
         ],
         [
-            "Success of the closed loop with depth images and arm, scenes reachable by suction",
-            estimate(loop, "success_of_arm_can", "success_of_arm_can_ci95"),
+            "Success of the closed loop with depth images and arm, all scenes",
+            estimate(loop, "success", "success_ci95"),
             "",
         ],
         [
@@ -93,9 +94,9 @@ def _headlines() -> list[list[str]]:
 def page() -> str:
     """Return the page."""
     return (
-        "# Results\n\nEvery number on these pages is read from a results file in "
-        "`training/results/` or `benchmarks/results/`, which names command, seed and "
-        "configuration. [Intervals](intervals.md) are 95 %; those of mean numbers of hidden "
+        "# Results\n\nThe measurements on these pages are read from results files in "
+        "`training/results/` and `benchmarks/results/`; each section names its command, seed and "
+        "files. [Intervals](intervals.md) are 95 %; those of mean numbers of hidden "
         "objects are of the normal approximation.\n\n"
         + table(
             ["page", "content"],

@@ -51,12 +51,15 @@ def page() -> str:
             for row in results["rows"]
         ],
     )
-    text += "\n## Where the time goes\n\nShares of the time of one worker.\n\n"
+    text += (
+        "\n## Where the time goes\n\nShares of the time of one worker, of some of the episodes.\n\n"
+    )
     text += table(["part", *IMAGES.values()], _share_rows(results["shares"]))
     text += (
         f"\n## More workers\n\nTime for {results['model_moves']:,} moves by a model, not by a "
         "measurement: every worker runs on a separate core and is as fast as the measured "
-        "one, and a single process reads all episodes for the card at the end. See "
+        "one, and a single process reads all episodes for the card at the end. The "
+        "moves per hour include the start and the card. See "
         "`benchmarks/recording_throughput.py`.\n\n"
     )
     text += table(
