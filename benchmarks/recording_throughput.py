@@ -154,7 +154,7 @@ def model_row(rate: float, start: float, serial: float, workers: int) -> dict[st
 
 def main(
     out: Annotated[Path, typer.Option(metavar="FILE", help="Results file to write (JSON).")],
-    episodes: Annotated[int, typer.Option(min=10, help="Number of episodes.")] = 40,
+    episodes: Annotated[int, typer.Option(min=PROFILED_EPISODES, help="Number of episodes.")] = 40,
     max_workers: Annotated[int, typer.Option(min=2, help="Largest number of workers.")] = 4,
     seed: SeedOption = 0,
 ) -> None:
@@ -166,7 +166,7 @@ def main(
     models = list[dict[str, Any]]()
     shares = dict[str, dict[str, float]]()
     for images, job in jobs.items():
-        shares[images] = profile(job, min(episodes, PROFILED_EPISODES))
+        shares[images] = profile(job, PROFILED_EPISODES)
         time_dataset(job, 1, 1)  # compiles and loads what the card needs
         small = time_dataset(job, 2, 1)
         timings = [time_dataset(job, episodes, workers) for workers in range(1, max_workers + 1)]

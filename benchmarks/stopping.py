@@ -196,7 +196,9 @@ def episodes(
         str, typer.Option(help=f"Detector: {PERFECT}, {', '.join(PRETRAINED_DETECTORS)}.")
     ] = PERFECT,
     count: Annotated[int, typer.Option(min=1, max=MAX_SCENES, help="Number of scenes.")] = 100,
-    first: Annotated[int, typer.Option(min=0, help="Index of the first scene.")] = 0,
+    first: Annotated[
+        int, typer.Option(min=0, max=MAX_SCENES - 1, help="Index of the first scene.")
+    ] = 0,
     max_moves: Annotated[int, typer.Option(min=1, help="Maximum number of moves.")] = 20,
     seed: SeedOption = 3000,
     workers: WorkersOption = 1,

@@ -18,7 +18,7 @@ MAX_VALUES = 10**7
 """Largest number of values of a document, with those of its aliases."""
 _INTEGER_TAG = "tag:yaml.org,2002:int"
 _FLOAT_TAG = "tag:yaml.org,2002:float"
-_INTEGER = re.compile(r"[-+]?[0-9]+$|0x[0-9a-fA-F]+$")
+_INTEGER = re.compile(r"[-+]?[0-9]+$|0o[0-7]+$|0x[0-9a-fA-F]+$")
 """Integers; YAML 1.1 reads 010 as octal, and 1:30 as 90."""
 _FLOAT = re.compile(
     r"[-+]?(\.[0-9]+|[0-9]+\.[0-9]*)([eE][-+]?[0-9]+)?$|[-+]?[0-9]+[eE][-+]?[0-9]+$"
@@ -54,7 +54,7 @@ class _Loader(yaml.CSafeLoader):
 
     def construct_integer(self, node: yaml.ScalarNode) -> int:
         text = str(node.value)
-        return int(text, 16) if text.startswith("0x") else int(text)
+        return int(text, {"0o": 8, "0x": 16}.get(text[:2], 10))
 
     def construct_whole_sequence(self, node: yaml.SequenceNode) -> list[Any]:
         return list(self.construct_sequence(node, deep=True))

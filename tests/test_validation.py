@@ -286,8 +286,8 @@ def test_numbers_with_an_exponent_are_numbers() -> None:
 
 def test_numbers_are_those_of_yaml_1_2() -> None:
     """YAML 1.1 reads 010 as 8, 1:30 as 90 and 1_000 as 1000."""
-    text = "[010, -7, +012, 0x1F, 0.5, 5., .5, -.inf]"
-    assert parse_yaml(text, "") == [10, -7, 12, 31, 0.5, 5.0, 0.5, -math.inf]
+    text = "[010, -7, +012, 0x1F, 0o17, 0.5, 5., .5, -.inf]"
+    assert parse_yaml(text, "") == [10, -7, 12, 31, 15, 0.5, 5.0, 0.5, -math.inf]
     texts = ["1:30", "1:30.5", "1_000", "0b11", "1.5_0", "0x", "-", "+.e3"]
     assert parse_yaml(f"[{', '.join(texts)}]", "") == texts
     assert parse_yaml(to_yaml([*texts, "010", 10, -0.0, 1e22]), "") == [

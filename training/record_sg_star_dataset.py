@@ -4,9 +4,9 @@
         --card training/datasets/sg_star_25_moves
 
 Random legal moves of the arm, five in an episode, with color, depth and segmentation of the
-overhead camera at 10 Hz. `train_bc.py` learns from them. The card, `README.md` with its pictures,
-and the options, `job.json`, are copied to the folder of `--card`, and `summary.json` with the
-commit of this software; the data stays in FOLDER. An interrupted run is resumed by the same
+overhead camera at 10 Hz. `train_bc.py evaluate` plays them. The card, `README.md` with its
+pictures, and the options, `job.json`, are copied to the folder of `--card`, and `summary.json` with
+the commit of this software; the data stays in FOLDER. An interrupted run is resumed by the same
 command. The scenes are those of an evaluation: an explorer that is trained on them is not to be
 evaluated on `sg_star_25`.
 """

@@ -148,7 +148,8 @@ class HomeSearch:
                 q = q[np.argsort(np.abs(q - middle).max(axis=1), kind="stable")]
                 collisions = [self._find_collision(row) for row in q]
                 clear = [row for row, pair in zip(q, collisions, strict=True) if pair is None]
-                collision = next((pair for pair in (collision, *collisions) if pair), None)
+                if collision is None:
+                    collision = next((distance for distance in collisions if distance), None)
                 found += clear[:1]
                 others += clear[1:]
         shape = -1, self._robot.num_joints

@@ -286,7 +286,7 @@ class ClosedLoop:
         if isinstance(plan, PlanningFailure) or self.simulation.executor_state.missed_grasp:
             picked = decision.move.pick
             outcome = evaluate_no_grasp(before, self.simulation.scene, picked, self._config.settle)
-            outcome = replace(outcome, detail="no vacuum built up")
+            outcome = replace(outcome, detail="the gripper did not hold it")
         else:
             picked, outcome = self._outcome(plan)
         decision = replace(decision, move=replace(decision.move, pick=picked))

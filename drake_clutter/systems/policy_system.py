@@ -87,7 +87,7 @@ class PolicySystem(LeafSystem):
         finished: Number of the latest finished plan, and by how much the object was released below
             its planned pose [m]. Shape (2,).
         status: `ExecutorStatus`, abstract; without one, every motion counts as a move of the
-            object. Where no vacuum has built up, another grasp is requested for the same move.
+            object. Where the gripper has missed it, another grasp is requested for the same move.
 
     Output ports:
         request: Latest `PlanRequest`, abstract.
@@ -247,7 +247,7 @@ class PolicySystem(LeafSystem):
         return Touch(status.felt_mass, excess_height)
 
     def _has_missed_grasp(self, context: Context) -> bool:
-        """Return whether the executor has found no vacuum at the grasp of the latest plan."""
+        """Return whether the gripper has missed the object of the latest plan."""
         if not self._status.HasValue(context):
             return False
         status: ExecutorStatus = self._status.Eval(context)

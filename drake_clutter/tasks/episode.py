@@ -227,8 +227,9 @@ class SteppedBackend:
         rng = self.outcome_rng
         command = resolve_placement(move, self.observation, self.config, rng)
         if command is None:
-            outcome = Outcome(MoveResult.NO_FREE_PLACEMENT, self.scene, failed_part=MovePart.PLACE)
-            self.belief = self.belief.record(move, outcome.result)
+            part = MovePart.PLACE
+            outcome = Outcome(MoveResult.NO_FREE_PLACEMENT, self.scene, failed_part=part)
+            self.belief = self.belief.record(move, outcome.result, failed_part=part)
         else:
             outcome = self.execute(command, rng)
             result = self.observable_result(outcome)
