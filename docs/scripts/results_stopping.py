@@ -17,7 +17,7 @@ def stopping() -> str:
         "which it was. Detector `labels` is perfect. `--first` and `--count` are the first scene "
         "and the number of scenes. Intervals are 95 %.",
         command="python benchmarks/stopping.py episodes --set DATASET --agent POLICY "
-        "--fidelity FIDELITY --first FIRST --count COUNT --out FILE",
+        "--fidelity static_or_drake --first 100 --count 60 --out FILE",
         seed=results["seed"],
         results=["benchmarks/results/stopping.json", "benchmarks/results/hidden_rates.json"],
     )
